@@ -3,23 +3,33 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from rlcli.errors import listing
+from rlcli.scaffold_mjcf_copy import (
+    FREE,
+    SCALAR,
+    collect_assets,
+    compile_copy,
+    default_pose,
+    put_robot_first,
+    remove_scene_elements,
+)
+from rlcli.scene.joint_units import LARGEST_LIMIT, doubtful_limits
+from rlcli.scene.reachable_positions import coupled_joints, follow_coupled_joints, random_poses, reachable_positions
 
 _CONTROL_DT = 0.02
 """Control period of the new task [s]."""
+_USUAL_DT, _REACH_DT = 0.002, 0.005
+"""Time step that MuJoCo takes for a file without one, and the time step of a reaching task for it [s]."""
 _MAX_DECIMATION = 20
 """Largest number of physics steps in a control period. A small robot with a short time step moves faster."""
-SCALAR = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
-"""Joint types with one position: hinge and slide."""
-_FREE = int(mujoco.mjtJoint.mjJNT_FREE)
 _VIEW = np.array([4.0, 4.0, 3.0])
 """Direction from the robot to the camera."""
 _ROOT = 1
@@ -37,16 +47,16 @@ class Robot:
             "sensors": [sensor.name for sensor in spec.sensors],
             "keyframes": [key.name for key in spec.keys],
         }
-        home = _default_pose(spec)
+        home = default_pose(spec)
         self.has_pose = home is not None
-        """Whether the file has a default pose. Without one, a joint starts at zero, or at its limit nearest to zero."""
-        _remove_scene_elements(spec)
+        """Whether the file has a default pose. Without one, joints are at zero, unless a limit is near or beyond it."""
+        remove_scene_elements(spec)
         original = spec.compile()
         tree = ElementTree.fromstring(spec.to_xml())
-        _put_robot_first(tree, original)
-        self.assets = _collect_assets(tree, spec, file)
+        put_robot_first(tree, original)
+        self.assets = collect_assets(tree, spec, file)
         self.xml = ElementTree.tostring(tree, encoding="unicode")
-        self.model = model = _compile_copy(self.xml, self.assets)
+        self.model = model = compile_copy(self.xml, self.assets)
         self.dt = model.opt.timestep if model.opt.timestep <= 0.01 else 0.005
         self.decimation = min(max(1, round(_CONTROL_DT / self.dt)), _MAX_DECIMATION)
         self.tempo = round3(min(1.0, _MAX_DECIMATION * self.dt / _CONTROL_DT))
@@ -57,40 +67,78 @@ class Robot:
         balls = [model.joint(j).name for j in range(model.njnt) if model.jnt_type[j] == int(mujoco.mjtJoint.mjJNT_BALL)]
         if balls:
             raise ValueError(f"ball joints are not supported: {listing(balls)}; use three hinges")
-        self.free = bool(model.njnt and model.body_jntnum[_ROOT] and model.jnt_type[0] == _FREE)
+        self.free = bool(model.njnt and model.body_jntnum[_ROOT] and model.jnt_type[0] == FREE)
         """Whether the base of the robot floats."""
         self.joints = [j for j in range(model.njnt) if model.jnt_type[j] in SCALAR]
         joint_actuator = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)
         self.actuator = {int(model.actuator_trnid[a, 0]): a for a in range(model.nu) if joint_actuator[a]}
+        names = [self.name(j) for j in self.joints]
+        self.doubts = [(message, hint) for message, hint, _ in doubtful_limits(model, self.joints, names)]
+        """Message and hint for each property of the file that is probably an error."""
         self.data = mujoco.MjData(model)
         for joint in self.joints:
             if home is not None and len(home) == model.nq:
                 self.data.qpos[model.jnt_qposadr[joint]] = home[original.joint(self.name(joint)).qposadr[0]]
+            if (
+                model.jnt_type[joint] == SCALAR[0]
+                and abs(value := self.data.qpos[model.jnt_qposadr[joint]]) > LARGEST_LIMIT
+            ):
+                found = f"the default pose has joint '{self.name(joint)}' at {value:.4g} rad"
+                self.doubts.append((found, "keyframes are in radians, in every file"))
             if model.jnt_limited[joint]:
                 address = model.jnt_qposadr[joint]
                 self.data.qpos[address] = np.clip(self.data.qpos[address], *model.jnt_range[joint])
         self.height = self._lower_to_ground() if self.free else 0.0
         """Height of the root above the ground in the default pose [m]."""
         locked = {j for j in self.joints if j not in self.actuator and self._is_locked(j)}
+        for pair in coupled_joints(model):  # one of the two joints moves with the other, such as two fingers
+            locked.add(next((j for j in pair[:2] if j not in self.actuator), -1))
         # without any actuator in the file, the task drives every joint that can move
         self.driven = [j for j in self.joints if j in self.actuator or not (model.nu or j in locked)]
         self.passive = [j for j in self.joints if j not in locked.union(self.driven)]
         mujoco.mj_forward(model, self.data)
         self.com_height = float(self.data.subtree_com[_ROOT, 2]) if self.free else 0.0
         """Height of a floating robot's centre of mass above the ground in the default pose [m]."""
-        self.inertia = self._inertia()
+        self.inertia = self._inertia(self.data)
 
-    def kind(self) -> str:
-        """Return the kind of task that fits the robot: velocity, reach or balance.
+    def fitting_kind(self) -> tuple[str, str]:
+        """Return the kind of task that fits the robot, velocity, reach or balance, and the reason.
 
         velocity: follow velocity commands; reach: move the last body to a goal; balance: keep the default pose.
         """
-        legged = self.free and self.gravity > 0.0 and self.feet()
-        if legged and len(self.driven) >= max(4, len(self.passive) + 1):
-            return "velocity"
-        if self.free or self.passive or len(self.driven) < 2:
-            return "balance"
-        return "reach" if np.ptp(self.workspace(), axis=1).max() > 0.01 else "balance"
+        driven, undriven = len(self.driven), [self.name(j) for j in self.passive]
+        without = f"{len(undriven)} of its joints have no actuator of their own ({listing(undriven, 3)})"
+        if self.free:
+            if obstacle := self.obstacle_to("velocity"):
+                return "balance", obstacle
+            if driven < 4:
+                return "balance", f"its base floats and it has feet, but only {driven} driven joints; walking needs 4"
+            if driven <= len(undriven):
+                return "balance", f"its base floats and it has feet, but {without}, and only {driven} do"
+            return "velocity", f"its base floats, it has {len(self.feet())} feet and {driven} driven joints"
+        if undriven:
+            return "balance", f"its base is fixed, but {without}"
+        if driven < 2:
+            return "balance", "its base is fixed, and it has only one driven joint; reaching needs 2"
+        if obstacle := self.obstacle_to("reach"):
+            return "balance", obstacle
+        return "reach", f"its base is fixed, and all of its {driven} joints are driven"
+
+    def obstacle_to(self, kind: str) -> str:
+        """Return why a kind of task is impossible for the robot; empty if it is possible."""
+        if kind == "velocity":
+            if not self.free:
+                return "its base is fixed"
+            if not self.gravity:
+                return "there is no gravity, so it cannot walk"
+            return "" if self.feet() else "no body besides the root touches the ground, so it has no feet"
+        if kind == "reach":
+            if self.free:
+                return "its base floats"
+            hand = self.body_name(self.last_body())
+            moves = np.ptp(self.workspace(), axis=0).max() > 0.01
+            return "" if moves else f"its joints do not move its last body '{hand}' by more than 1 cm"
+        return ""
 
     def name(self, joint: int) -> str:
         """Return the name of the joint with this id."""
@@ -141,20 +189,50 @@ class Robot:
         resistance = 0.01 * self.model.dof_damping[dof] + self.model.dof_frictionloss[dof]
         return bool(resistance > abs(self.max_effort(joint)))
 
-    def joint_settings(self) -> dict[str, dict[str, float]]:
+    def joint_settings(self, kind: str) -> dict[str, dict[str, float]]:
         """Return joint name -> kp, kv and effort_limit, for joints without a position actuator in the file.
 
-        They are estimated from the largest effort and the inertia of each joint.
+        The joints of a walking robot are compliant. Those of an arm follow their targets with a lag of 0.1 s, so stiff
+        that gravity displaces the last body by a small part of its workspace.
         """
         settings = {}
+        stiff = self._stiff_gains() if kind == "reach" else {}
         for joint in self.driven:
-            if joint in self.actuator and self.model.actuator_biasprm[self.actuator[joint], 1] < 0.0:
-                continue  # a position actuator: the file has its gains
+            if self.has_gains(joint):
+                continue
             effort = abs(self.max_effort(joint))
-            kp = effort * (10.0 if self.model.jnt_type[joint] == SCALAR[1] else 1.0)  # full effort at 0.1 m or 1 rad
-            kv = 2.0 * 0.5 * math.sqrt(kp * self.inertia[joint])  # damping ratio 0.5
+            if joint in stiff:
+                kp, kv = stiff[joint]
+            else:
+                kp = effort * (10.0 if self.model.jnt_type[joint] == SCALAR[1] else 1.0)  # all of it at 0.1 m or 1 rad
+                kv = 2.0 * 0.5 * math.sqrt(kp * self.inertia[joint])  # damping ratio 0.5
             settings[self.name(joint)] = {"kp": round3(kp), "kv": round3(kv), "effort_limit": round3(effort)}
         return settings
+
+    def has_gains(self, joint: int) -> bool:
+        """Return whether the file has a position actuator for a joint."""
+        return joint in self.actuator and bool(self.model.actuator_biasprm[self.actuator[joint], 1] < 0.0)
+
+    def _stiff_gains(self) -> dict[int, tuple[float, float]]:
+        """Return joint -> kp and kv of stiff, overdamped servos.
+
+        Gravity turns a point mass at the distance r by g / (r w^2), so w^2 = g / d gives a displacement of d at any r.
+        """
+        sag = 0.005 * float(np.ptp(self.workspace(), axis=0).max())
+        frequency = min(max(math.sqrt((self.gravity or 9.81) / sag), 20.0 / self.tempo), 0.3 / self.dt)
+        largest = dict.fromkeys(self.driven, 0.0)
+        data = mujoco.MjData(self.model)
+        for qpos in random_poses(self.model, self.data.qpos, self.driven, self.offsets(), 64):
+            data.qpos[:] = qpos
+            mujoco.mj_forward(self.model, data)
+            inertia = self._inertia(data)
+            largest = {j: max(largest[j], inertia[j]) for j in self.driven}
+        gains, lag = {}, 0.1 * self.tempo
+        for joint, inertia_of_joint in largest.items():
+            damping = float(self.model.dof_damping[self.model.jnt_dofadr[joint]])
+            kp = inertia_of_joint * frequency**2 + damping / lag
+            gains[joint] = kp, lag * kp
+        return gains
 
     def sim_settings(self) -> dict[str, Any]:
         """Return the physics settings of the task as data of its YAML."""
@@ -162,21 +240,21 @@ class Robot:
         gravity = [float(value) for value in self.model.opt.gravity]
         return settings if gravity == [0.0, 0.0, -9.81] else settings | {"gravity": gravity}
 
-    def scene_settings(self) -> dict[str, Any]:
-        """Return the key `scene` of the task for this robot, as data for its YAML."""
+    def scene_settings(self, kind: str) -> dict[str, Any]:
+        """Return the key `scene` of a task of this kind for the robot, as data for its YAML."""
         robot: dict[str, Any] = {"model": "model.xml"}
         if self.free:
             robot["pos"] = [0.0, 0.0, round(self.height + 0.005, 4)]
-        if self.kind() != "balance" and (settings := self.joint_settings()):
+        if kind != "balance" and (settings := self.joint_settings(kind)):
             robot["joints"] = settings
         pose = {self.name(j): round(float(self.data.qpos[self.model.jnt_qposadr[j]]), 4) for j in self.joints}
         if pose := {name: value for name, value in pose.items() if value}:
             robot["init"] = {"joint_pos": pose}
-        envs = 256 if self.kind() == "velocity" else 512
+        envs = 256 if kind == "velocity" else 512
         return {"num_envs": envs, "env_spacing": 2.5, "entities": {"robot": robot}}
 
-    def viewer_settings(self) -> dict[str, Any]:
-        """Return the camera of the task: it looks at the robot in its default pose and sees it as a whole."""
+    def viewer_settings(self, kind: str) -> dict[str, Any]:
+        """Return the camera of a task of this kind, which sees the whole robot in its default pose."""
         model, data = self.model, self.data
         solid = [g for g in range(model.ngeom) if model.geom_bodyid[g]]
         points, radii = np.vstack([data.xpos[1:], data.geom_xpos[solid]]), np.zeros((model.nbody - 1 + len(solid), 1))
@@ -185,7 +263,7 @@ class Robot:
         lookat = 0.5 * (low + high)
         eye = lookat + 1.5 * max(float(np.linalg.norm(high - low)), 0.1) * _VIEW / np.linalg.norm(_VIEW)
         place = {name: [round(float(x), 3) + 0.0 for x in point] for name, point in (("eye", eye), ("lookat", lookat))}
-        return place | ({"follow": "robot"} if self.kind() == "velocity" else {})
+        return place | ({"follow": "robot"} if kind == "velocity" else {})
 
     def feet(self) -> list[str]:
         """Return the names of the bodies, without the root, that touch the ground in the default pose within 1 cm."""
@@ -220,32 +298,59 @@ class Robot:
                 found.append(body)
         return list(dict.fromkeys(found))
 
-    def _inertia(self) -> dict[int, float]:
-        """Return joint id -> diagonal element of the mass matrix in the default pose [kg or kg m^2]."""
+    def _inertia(self, data: mujoco.MjData) -> dict[int, float]:
+        """Return joint id -> diagonal element of the mass matrix in the pose of `data` [kg or kg m^2]."""
         matrix = np.zeros((self.model.nv, self.model.nv))
-        mujoco.mj_fullM(self.model, self.data, matrix)
+        mujoco.mj_fullM(self.model, data, matrix)
         return {j: float(matrix[self.model.jnt_dofadr[j], self.model.jnt_dofadr[j]]) for j in self.joints}
 
-    def workspace(self) -> list[list[float]]:
-        """Return a box of positions that the last body can reach: [low, high] along x, y and z [m].
+    def prepare_for_reaching(self) -> None:
+        """Choose the default pose and the physics step of a reaching task.
 
-        300 random poses near the default one are tried; the box goes from 20 % to 80 % of the positions along each
-        axis. Positions are in the frame of the fixed root, as the goals of commands.
+        Without a default pose in the file, a joint that cannot turn far from zero in both directions starts in the
+        middle of its range. The step of MuJoCo's default is long enough for contacts; reaching needs fewer steps.
         """
-        generator, model, data = np.random.default_rng(0), self.model, mujoco.MjData(self.model)
-        body, turn = self.last_body(), np.zeros(9)
+        model, ranges = self.model, self.model.jnt_range
+        for joint in [] if self.has_pose else self.driven:
+            address, middle = model.jnt_qposadr[joint], 0.5 * ranges[joint].sum()
+            if model.jnt_limited[joint] and abs(self.data.qpos[address] - middle) > 0.25 * np.ptp(ranges[joint]):
+                self.data.qpos[address] = float(f"{middle:.3g}")
+        follow_coupled_joints(model, self.data.qpos[None], self.driven)
+        mujoco.mj_forward(model, self.data)
+        fastest = max((self._servo_frequency(j) for j in self.driven if self.has_gains(j)), default=0.0)
+        if self.dt == _USUAL_DT and fastest * _REACH_DT < 0.5:
+            self.dt, self.decimation = _REACH_DT, round(_CONTROL_DT / _REACH_DT)
+
+    def _servo_frequency(self, joint: int) -> float:
+        """Return the natural frequency of a joint with a position actuator in the default pose [rad/s]."""
+        actuator = self.actuator[joint]
+        stiffness = -self.model.actuator_biasprm[actuator, 1] * self.model.actuator_gear[actuator, 0] ** 2
+        return math.sqrt(stiffness / max(self.inertia[joint], 1e-9))
+
+    def workspace(self) -> NDArray[np.float64]:
+        """Return positions that the last body reaches, in the frame of the fixed root. (n, 3) [m]"""
+        model, turn = self.model, np.zeros(9)
         mujoco.mju_quat2Mat(turn, model.body_quat[_ROOT])
-        places = []
-        for _ in range(300):
-            data.qpos[:] = self.data.qpos
-            for joint in self.driven:
-                address, spread = model.jnt_qposadr[joint], 0.6 if model.jnt_type[joint] == SCALAR[0] else 0.1
-                value = data.qpos[address] + generator.uniform(-spread, spread)
-                limits = model.jnt_range[joint] if model.jnt_limited[joint] else (-np.inf, np.inf)
-                data.qpos[address] = np.clip(value, *limits)
-            mujoco.mj_kinematics(model, data)
-            places.append((data.xpos[body] - model.body_pos[_ROOT]) @ turn.reshape(3, 3))
-        return [[round(float(x), 3) for x in ends] for ends in np.percentile(places, [20, 80], axis=0).T]
+        found = reachable_positions(model, self.data.qpos, self.driven, self.last_body(), self.offsets())
+        places: NDArray[np.float64] = (found - model.body_pos[_ROOT]) @ turn.reshape(3, 3)
+        return places
+
+    def offsets(self) -> tuple[float, float]:
+        """Return the range of joint positions about the default pose in which goals are drawn [m or rad].
+
+        It includes a full turn of hinges; limits of the joints count in addition. Slides without limits move 0.5 m.
+        """
+        endless = any(self.model.jnt_type[j] != SCALAR[0] and not self.model.jnt_limited[j] for j in self.driven)
+        largest = 0.5 if endless else round3(math.pi)
+        return -largest, largest
+
+    def action_scales(self) -> dict[str, float]:
+        """Return joint name -> a quarter of the range of positions in which goals are drawn, at most 1 [m or rad]."""
+        scales = {}
+        for joint in self.driven:
+            low, high = self.model.jnt_range[joint] if self.model.jnt_limited[joint] else self.offsets()
+            scales[self.name(joint)] = round3(min(1.0, 0.25 * float(high - low)))
+        return scales
 
     def last_body(self) -> int:
         """Return the id of the body at the end of the longest chain of driven joints, such as a gripper."""
@@ -258,125 +363,6 @@ class Robot:
             return count
 
         return max(range(1, self.model.nbody), key=lambda body: (length(body), body))
-
-
-def _default_pose(spec: mujoco.MjSpec) -> np.ndarray | None:
-    """Return the robot's default pose as `qpos` (nq,), or None if the MJCF has no default pose.
-
-    It is the pose of the keyframe `home` or `stand`, else of the first keyframe, else the value of the element
-    `numeric` with the name `init_qpos`.
-    """
-    keys = sorted(spec.keys, key=lambda key: key.name not in ("home", "stand", "standing"))
-    start = next((numeric for numeric in spec.numerics if numeric.name == "init_qpos"), None)  # a habit of Gymnasium
-    if keys:
-        return np.array(keys[0].qpos)
-    return None if start is None else np.array(start.data)
-
-
-def _remove_scene_elements(spec: mujoco.MjSpec) -> None:
-    """Remove ground, lights and keyframes, which the task defines itself; name all bodies, joints and actuators.
-
-    Welds and connections to mocap bodies are removed, too: a task does not move mocap bodies, so they would hold the
-    robot. If all actuators pull at tendons, they are removed, and the task drives the joints directly.
-    """
-    if all(actuator.trntype == mujoco.mjtTrn.mjTRN_TENDON for actuator in spec.actuators):
-        measured = [sensor for sensor in spec.sensors if sensor.objtype == mujoco.mjtObj.mjOBJ_ACTUATOR]
-        for element in (*measured, *list(spec.actuators)):
-            spec.delete(element)
-    for key in list(spec.keys):
-        spec.delete(key)
-    mocap = {body.name for body in spec.bodies if body.mocap}
-    mocap |= {site.name for site in spec.sites if site.parent.mocap}
-    for tie in list(spec.equalities):
-        if tie.type in (mujoco.mjtEq.mjEQ_WELD, mujoco.mjtEq.mjEQ_CONNECT) and {tie.name1, tie.name2} & mocap:
-            spec.delete(tie)
-    world = spec.worldbody
-    for geom in list(world.geoms):
-        if geom.type in (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD):
-            spec.delete(geom)
-    for light in list(spec.lights):
-        spec.delete(light)
-    for kind, elements in (("body", spec.bodies[1:]), ("joint", spec.joints), ("actuator", spec.actuators)):
-        taken = {element.name for element in elements}
-        for number, element in enumerate(elements):
-            if not element.name:
-                element.name = next(n for i in range(number, 10**6) if (n := f"{kind}{i}") not in taken)
-                taken.add(element.name)
-
-
-def _put_robot_first(tree: ElementTree.Element, model: mujoco.MjModel) -> None:
-    """Make the top-level body with most driven joints the first one, because rlcli takes the first body as the root.
-
-    If the body has a free joint, it is placed at the origin. If its z axis does not point up, `_insert_level_root`
-    gives it a parent whose z axis does.
-    """
-    joint_actuator = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)
-    driven = model.actuator_trnid[joint_actuator, 0] if model.nu else np.flatnonzero(np.isin(model.jnt_type, SCALAR))
-    world, bodies = tree.find("worldbody"), tree.findall("worldbody/body")
-    if world is None or not len(driven):
-        return
-    root = int(np.bincount(model.body_rootid[model.jnt_bodyid[driven]]).argmax())
-    robot = next(body for body in bodies if body.get("name") == model.body(root).name)
-    begin = list(world).index(bodies[0])
-    world.remove(robot)
-    world.insert(begin, robot)
-    if model.body_dofnum[root] < 6 or model.jnt_type[model.body_jntadr[root]] != _FREE:
-        return
-    for body in bodies:  # other bodies keep their place relative to the robot
-        place = model.body(body.get("name")).pos - model.body_pos[root]
-        body.set("pos", " ".join(f"{value:.6g}" for value in place))
-    if 1.0 - 2.0 * float(np.square(model.body_quat[root, 1:3]).sum()) < 0.95:  # its z axis is not up
-        _insert_level_root(robot)
-
-
-def _insert_level_root(body: ElementTree.Element) -> None:
-    """Give a free body a new parent with the free joint, whose z axis points up: terms read the tilt of the root.
-
-    The element of the body becomes the new parent, and a copy of the body its child.
-    """
-    child = ElementTree.Element("body", body.attrib | {"pos": "0 0 0"})
-    joints = [part for part in body if part.tag == "freejoint" or part.get("type") == "free"]
-    child.extend([part for part in body if part not in joints])
-    kept = {key: value for key, value in body.attrib.items() if key in ("childclass", "pos")}
-    body.clear()
-    body.attrib.update(kept, name=f"{child.attrib['name']}_level")
-    body.extend([*joints, child])
-
-
-def _collect_assets(tree: ElementTree.Element, spec: mujoco.MjSpec, file: Path) -> dict[str, Path]:
-    """Change the paths of all files that an MJCF loads to the folder `assets`; return new path -> present file."""
-    found: dict[str, Path] = {}
-    home = Path(spec.modelfiledir or file.parent)
-    for element in tree.iter():
-        for key in [key for key in element.attrib if key.startswith("file") and element.tag != "text"]:
-            name = element.attrib[key]
-            folder = spec.texturedir if element.tag == "texture" else spec.meshdir
-            origin = next((path for path in (home / folder / name, home / name) if path.is_file()), None)
-            if origin is None:
-                raise ValueError(f"a {element.tag} loads {home / folder / name}, which does not exist; move it there")
-            place = f"assets/{origin.name}"
-            for number in range(len(found)):  # another file may have the same name
-                if found.get(place, origin).resolve() == origin.resolve():
-                    break
-                place = f"assets/{number}_{origin.name}"
-            found[place] = origin
-            element.set(key, Path(place).name)
-    compiler = tree.find("compiler")
-    if compiler is None:
-        compiler = ElementTree.SubElement(tree, "compiler")
-    for key in ("assetdir", "strippath"):
-        compiler.attrib.pop(key, None)
-    compiler.attrib.update(meshdir="assets", texturedir="assets")
-    return found
-
-
-def _compile_copy(xml: str, assets: Mapping[str, Path]) -> mujoco.MjModel:
-    """Compile an MJCF text with the files `assets` (path in the MJCF -> file), which are given to MuJoCo in memory.
-
-    Raises:
-        ValueError: if MuJoCo cannot compile it, for example because it needs a further file.
-    """
-    return mujoco.MjModel.from_xml_string(xml, {place: origin.read_bytes() for place, origin in assets.items()})
 
 
 def _lowest_z(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float:

@@ -14,13 +14,23 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from rlcli.config.strict_yaml import load
-from rlcli.errors import TaskError, UsageError, listing
-from rlcli.scaffold_mjcf import SCALAR, Robot, round3
+from rlcli.errors import TaskError, UsageError, listing, require_known
+from rlcli.scaffold_mjcf import Robot, round3
+from rlcli.scaffold_mjcf_copy import SCALAR
 from rlcli.scene.mjcf_scan import BadModel
 from rlcli.scene.untrusted_mjcf import read_mjcf
 
 _TEMPLATES = Path(__file__).parent / "templates" / "robot_tasks"
+
+_AGENT_VALUES: dict[str, dict[str, Any]] = {
+    "velocity": {"max_iterations": 1500, "gamma": 0.99, "entropy_coef": 0.005},
+    # a horizon of 0.7 s, in which an arm reaches most goals; little noise at the end, so that the arm settles
+    "reach": {"max_iterations": 1000, "gamma": 0.97, "entropy_coef": 0.001},
+    "balance": {"max_iterations": 300, "gamma": 0.99, "entropy_coef": 0.005},
+}
 
 
 @dataclass(slots=True)
@@ -29,6 +39,8 @@ class RobotTask:
 
     kind: str
     """Kind of the task: velocity, reach or balance."""
+    reason: str
+    """Why the robot gets a task of this kind."""
     model: str
     """The MJCF of the task."""
     assets: dict[str, Path]
@@ -39,13 +51,20 @@ class RobotTask:
     """Names of the elements of the MJCF, under the keys `joints`, `actuators`, `sensors` and `keyframes`."""
     has_pose: bool
     """Whether the MJCF has a default pose: a keyframe, or the element `numeric` with the name `init_qpos`."""
+    doubts: list[tuple[str, str]]
+    """Message and hint for each property of the MJCF that is probably an error, such as a wrong unit."""
 
 
-def read_robot(file: Path, name: str) -> RobotTask:
+def read_robot(file: Path, name: str, kind: str | None = None) -> RobotTask:
     """Read an MJCF and design a task for its robot.
 
+    Args:
+        file: the MJCF.
+        name: name of the task.
+        kind: velocity, reach or balance; None: the kind that fits the robot.
+
     Raises:
-        UsageError: if there is no such file, or the robot has nothing that can be controlled.
+        UsageError: if there is no such file, the robot has nothing that can be controlled, or the kind is impossible.
         TaskError: if MuJoCo cannot compile the model, or it has an element that rlcli refuses.
     """
     if file.is_dir():
@@ -65,7 +84,16 @@ def read_robot(file: Path, name: str) -> RobotTask:
         raise UsageError(
             f"{file}: no joint can be driven", hint="add hinges or slides, with motors or position actuators"
         )
-    kind = robot.kind()
+    fitting, reason = robot.fitting_kind()
+    if kind is None:
+        kind, reason = fitting, f"{reason}; --kind chooses another"
+    else:
+        require_known(kind, list(_SUMMARIES), "kind of task", "kinds")
+        reason = f"--kind says so; without it {fitting}, because {reason}"
+        if obstacle := robot.obstacle_to(kind):
+            raise UsageError(f"--kind {kind} is impossible for {file}: {obstacle}", hint=f"try --kind {fitting}")
+    if kind == "reach":
+        robot.prepare_for_reaching()
     parts = {"velocity": _velocity, "reach": _reach, "balance": _balance}[kind](robot)
     sensors = parts.pop("_sensors", {})
     task = {
@@ -73,17 +101,17 @@ def read_robot(file: Path, name: str) -> RobotTask:
         "decimation": robot.decimation,
         "episode_length_s": round3(robot.tempo * (20.0 if kind == "velocity" else 8.0)),
         "sim": robot.sim_settings(),
-        "scene": robot.scene_settings() | {"sensors": sensors},
-        "viewer": robot.viewer_settings(),
+        "scene": robot.scene_settings(kind) | {"sensors": sensors},
+        "viewer": robot.viewer_settings(kind),
         **parts,
         "play": {"scene": {"num_envs": 16}},
         "agents": {
             "default": "ppo",
-            "ppo": _fill("agent", {"max_iterations": 1500 if kind == "velocity" else 300}),
+            "ppo": _fill("agent", _AGENT_VALUES[kind]),
         },
     }
     task = json.loads(json.dumps(task))  # without shared lists, which YAML would write as anchors
-    return RobotTask(kind, robot.xml, robot.assets, task, robot.found, robot.has_pose)
+    return RobotTask(kind, reason, robot.xml, robot.assets, task, robot.found, robot.has_pose, robot.doubts)
 
 
 def _asset_roots(file: Path) -> list[Path]:
@@ -142,13 +170,18 @@ def _velocity(robot: Robot) -> dict[str, Any]:
 
 
 def _reach(robot: Robot) -> dict[str, Any]:
-    box = robot.workspace()
+    extents = np.ptp(robot.workspace(), axis=0)
+    size = float(extents.max())
     values = {
         "joints": [robot.name(j) for j in robot.driven],
         "hand": robot.body_name(robot.last_body()),
         "period": round3(8.0 * robot.tempo),
-        **dict(zip("xyz", box, strict=True)),
-        "moving_axes": [i for i in range(3) if box[i][0] < box[i][1]],
+        "offsets": robot.offsets(),
+        "scales": robot.action_scales(),
+        "moving_axes": [i for i in range(3) if extents[i] > 0.01 * size],
+        "distance_weight": round3(-4.0 / size),
+        "near_std": round3(0.05 * size),
+        "at_most": round3(0.025 * size),
         "hold_s": round3(0.5 * robot.tempo),
     }
     return _fill("reach", values)

@@ -17,7 +17,8 @@ REPOSITORY = PACKAGE.parent
 LAYERS = """
     errors task trainers formats random machine settings safe_text progress
     registry  config  sim  scene  managers  envs  mdp  rl  runs  replay  evaluation  deploy  viewer  reporting  testing
-    training  adapters  tuning  doctor  scaffold_mjcf  scaffold_robot  scaffold  api  cli  gym  pytest_plugin
+    training  adapters  tuning  doctor  scaffold_mjcf_copy  scaffold_mjcf  scaffold_robot  scaffold  api  cli
+    gym  pytest_plugin
 """
 """Lowest first. All names of the first line are one layer; each later name is a separate layer."""
 TRAINERS = sorted(file.parent.name for file in PACKAGE.glob("rl/*/config.py"))

@@ -312,6 +312,16 @@ def _generated_commands(env: VecEnv, command: CommandTerm, columns: list[int] | 
     return whole if columns is None else op("take", whole, [float(column) for column in columns])
 
 
+def _body_to_goal(
+    env: VecEnv, entity: Entity, bodies: Columns, command: CommandTerm, columns: list[int] | None
+) -> Formula:
+    (body,) = _selected(entity.body_ids, bodies)
+    goal = _generated_commands(env, command, [0, 1, 2])
+    place = op("unrotate", _root_quat(entity), op("sub", _row_of("xpos", body, 3), _root_pos(entity)))
+    offset = op("sub", goal, place)
+    return offset if columns is None else op("take", offset, [float(column) for column in columns])
+
+
 _OBSERVATIONS: Mapping[str, Callable[..., Formula]] = {
     "joint_pos": lambda env, entity, joints: _joint_field(entity, "qpos", joints),
     "joint_vel": lambda env, entity, joints: _joint_field(entity, "qvel", joints),
@@ -345,6 +355,7 @@ _OBSERVATIONS: Mapping[str, Callable[..., Formula]] = {
     "body_state_b": _body_state_b,
     "last_action": lambda env: given("last_action"),
     "generated_commands": _generated_commands,
+    "body_to_goal": _body_to_goal,
     "current_time_s": lambda env: op("mul", given("steps"), [env.step_dt]),
     "remaining_time_s": lambda env: op(
         "mul", op("sub", [float(env.max_episode_length)], given("steps")), [env.step_dt]

@@ -10,11 +10,12 @@ from torch import Tensor
 from rlcli.mdp.term import EntityTerm, Term
 from rlcli.mdp.term_helpers import distance_to_goal, goal_in_world, goal_quat_in_world
 from rlcli.scene.entity_mirror import QUATERNION, VECTOR
+from rlcli.scene.reachable_positions import reachable_positions
 from rlcli.sim.env_selection import Selection, one_column
 from rlcli.sim.markers import ACTUAL, COMMANDED, Arrow, Color, Frame, Marker, Sphere
-from rlcli.sim.rotations import atan2, from_euler, heading, rotate, unique, wrap_to_pi, yaw_only
+from rlcli.sim.rotations import atan2, from_euler, heading, rotate, rotate_inverse, unique, wrap_to_pi, yaw_only
 from rlcli.sim.saved_tensors import TensorState
-from rlcli.task import Bodies, Range
+from rlcli.task import Bodies, Joints, Range
 
 _ARM = 0.5
 """Distance ahead of the root at which an arrow shows the yaw rate [m]."""
@@ -246,6 +247,53 @@ class UniformPose(EntityTerm):
         """Return a green sphere at the goal, and the axes of the goal pose."""
         position, quat = self.pose_w
         return [Sphere(position, label="goal"), Frame(position, quat, label="goal")]
+
+
+@dataclass(kw_only=True, eq=False)
+class ReachablePosition(EntityTerm):
+    """Position that a body of a robot with a fixed base can reach, in the root's frame [m]. (num_envs, 3)
+
+    The positions are those of the body at 2,048 random positions of `joints`, without poses in which links touch each
+    other or the scene. position: range of the offset from the default joint position [m or rad]; joint limits count.
+    """
+
+    elements = ("x", "y", "z")
+    units = ("m", "m", "m")
+    mirror_signs = VECTOR
+
+    bodies: Bodies
+    joints: Joints = ".*"
+    position: Range = (-3.1415927, 3.1415927)
+
+    def __post_init__(self) -> None:
+        entity, data = self.entity, self.entity.data
+        body = int(entity.body_ids[one_column(self.bodies, len(entity.body_ids), "bodies")])
+        qpos = entity.engine.model.qpos0.copy()
+        qpos[entity.qpos_columns.cpu()] = data.default_joint_pos[0].cpu()
+        joints = entity.joint_ids[self.joints if isinstance(self.joints, slice) else self.joints.cpu()]
+        found = reachable_positions(entity.engine.model, qpos, joints.tolist(), body, self.position)
+        places = torch.tensor(found, dtype=torch.float32, device=self.env.device)
+        root, turn = data.default_root_state[:1, :3], data.default_root_state[:1, 3:7]
+        self._positions = rotate_inverse(turn.expand(len(places), 4), places - root)
+        low, high = self._positions.amin(dim=0).tolist(), self._positions.amax(dim=0).tolist()
+        self.limits = list(zip(low, high, strict=True))
+        """Smallest and largest position along each axis [m]."""
+        self.command = torch.zeros(self.env.num_envs, 3, device=self.env.device)
+
+    def resample(self, selection: Selection) -> None:
+        """Draw goal positions for the selected environments."""
+        selection.write(self.command, self._positions[selection.choice(len(self._positions))])
+
+    def update(self) -> None:
+        """Do nothing: the goal is fixed in the root's frame."""
+
+    def metrics(self) -> dict[str, Tensor]:
+        """Return the distance between the body and its goal [m]. (num_envs,)"""
+        return {"position_error": distance_to_goal(self.entity, self.bodies, self)}
+
+    def markers(self) -> list[Marker]:
+        """Return a green sphere at the goal."""
+        return [Sphere(goal_in_world(self.entity, self), label="goal")]
 
 
 @dataclass(kw_only=True, eq=False)

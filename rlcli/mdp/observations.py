@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from rlcli.mdp.parameter_types import CameraSensor, Command, ContactSensor, Entity, ManagedEnv, RaySensor
-from rlcli.mdp.term_helpers import HandleTerm, constant, single
+from rlcli.mdp.term_helpers import HandleTerm, constant, goal_in_world, single
 from rlcli.sim.rotations import atan2, conjugate, length, multiply, roll_pitch_yaw, rotate_inverse, unique, wrap_to_pi
 from rlcli.task import Bodies, Joints, Sensors, Sites, reads_body_forces
 
@@ -188,12 +188,15 @@ def last_action(env: ManagedEnv) -> Tensor:
 
 def generated_commands(env: ManagedEnv, *, command: Command, columns: list[int] | None = None) -> Tensor:
     """Command of a term of `commands:`, or some of its columns. (num_envs, k)"""
-    value: Tensor = command.command
-    if columns is None:
-        return value
-    if not columns or not all(0 <= column < value.shape[1] for column in columns):
-        raise ValueError(f"`columns` is {columns}; give one or more of 0 to {value.shape[1] - 1}, or leave it out")
-    return torch.stack([value[:, column] for column in columns], dim=1)
+    return _columns_of(command.command, columns)
+
+
+def body_to_goal(
+    env: ManagedEnv, *, entity: Entity = "robot", bodies: Bodies, command: Command, columns: list[int] | None = None
+) -> Tensor:
+    """Vector from a body to the goal of a pose command of `entity`, in its root's frame [m]. (num_envs, k)"""
+    offset = goal_in_world(entity, command) - single(entity.data.body_pos_w[:, bodies], "body")
+    return _columns_of(rotate_inverse(entity.data.root_quat_w, offset), columns)
 
 
 def current_time_s(env: ManagedEnv) -> Tensor:
@@ -371,6 +374,14 @@ def goal_quat_diff(
     """
     quat = multiply(object.data.root_quat_w, conjugate(command.command[:, 3:7]))
     return unique(quat) if make_quat_unique else quat
+
+
+def _columns_of(value: Tensor, columns: list[int] | None) -> Tensor:
+    if columns is None:
+        return value
+    if not columns or not all(0 <= column < value.shape[1] for column in columns):
+        raise ValueError(f"`columns` is {columns}; give one or more of 0 to {value.shape[1] - 1}, or leave it out")
+    return torch.stack([value[:, column] for column in columns], dim=1)
 
 
 def _offset_xy(env: ManagedEnv, entity: Entity, target: tuple[float, float, float]) -> Tensor:

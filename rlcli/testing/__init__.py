@@ -14,6 +14,7 @@ for finding in check_task("acrobot"):
 from rlcli.testing.checks import CHECKS, check_task, record_layout
 from rlcli.testing.findings import Finding
 from rlcli.testing.lint import lint_task
-from rlcli.testing.lint_rules import RULES, Remark
+from rlcli.testing.lint_rules import RULES
+from rlcli.testing.remarks import Remark
 
 __all__ = ["CHECKS", "RULES", "Finding", "Remark", "check_task", "lint_task", "record_layout"]

@@ -21,7 +21,8 @@ from rlcli.errors import ConfigError, MachineError, UsageError, require_known
 from rlcli.progress import tracked
 from rlcli.testing.findings import task_error_text
 from rlcli.testing.fixed_policy_rollouts import RolloutEvidence
-from rlcli.testing.lint_rules import RULES, Remark
+from rlcli.testing.lint_rules import RULES
+from rlcli.testing.remarks import Remark
 from rlcli.testing.task_under_test import open_task
 
 

@@ -5,10 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field
-from functools import partial
 from itertools import cycle, islice, product
-from typing import Any, Literal
 
 import mujoco
 import torch
@@ -18,42 +15,12 @@ from rlcli.config.layers import leaves
 from rlcli.config.schema import AgentConfig
 from rlcli.envs.managed import ManagedEnv
 from rlcli.envs.vec_env import VecEnv
+from rlcli.testing.angle_rules import degrees, joint_limits
 from rlcli.testing.findings import task_error_text
 from rlcli.testing.fixed_policy_rollouts import FIXED_POLICIES, MAX_STEPS, RolloutEvidence, record_rollout
+from rlcli.testing.remarks import Remark, error_at, warning_at
 from rlcli.testing.task_under_test import observation_parts
 from rlcli.testing.timestep_checks import energy_drift
-
-
-@dataclass(frozen=True, slots=True)
-class Remark:
-    """Finding of a lint rule: a property of a task that makes learning hard."""
-
-    rule: str
-    """Name of the rule."""
-    severity: Literal["error", "warning"]
-    where: str
-    """Term, column or setting."""
-    message: str
-    """What was found."""
-    hint: str
-    """What to do."""
-    numbers: dict[str, float] = field(default_factory=dict)
-    """Measured values by name."""
-
-    def __str__(self) -> str:
-        """Return the remark as one line."""
-        return f"{self.severity}: {self.rule}: {self.where}: {self.message}; {self.hint}"
-
-    def record(self) -> dict[str, Any]:
-        """Return the remark as JSON, which has no infinity: such numbers become null."""
-        numbers = {name: value if math.isfinite(value) else None for name, value in self.numbers.items()}
-        return {**asdict(self), "numbers": numbers}
-
-
-error_at = partial(Remark, "", "error")
-"""(where, message, hint, numbers) -> error of the running rule; the linter adds the name of the rule."""
-warning_at = partial(Remark, "", "warning")
-"""(where, message, hint, numbers) -> warning of the running rule; the linter adds the name of the rule."""
 
 
 def stops(evidence: RolloutEvidence) -> Iterator[Remark]:
@@ -397,31 +364,6 @@ def horizon(evidence: RolloutEvidence) -> Iterator[Remark]:
         yield warning_at(f"agents.{name}.gamma = {gamma:g}", message, hint, numbers)
 
 
-_LARGEST_ANGLES = {"limit_angle": math.pi, **dict.fromkeys(("roll", "pitch", "yaw", "heading"), 2.0 * math.pi)}
-"""Parameter of a term -> largest sensible angle [rad]; above it the angle may be in degrees. A tilt is at most pi."""
-
-
-def degrees(evidence: RolloutEvidence) -> Iterator[Remark]:
-    """Check that no angle is so large that it may be in degrees: a limit above pi, a rotation or tilt above 2 pi."""
-    for path, value in leaves(evidence.subject.resolved.task.model_dump()):
-        bound = _LARGEST_ANGLES.get(str(path[-1])) if path and path[0] in _SECTIONS_WITH_ANGLES else None
-        numbers = [v for v in (value if isinstance(value, list | tuple) else [value]) if isinstance(v, int | float)]
-        largest = max(map(abs, numbers), default=0.0)
-        if bound is not None and bound * 1.01 < largest < math.inf:
-            message = f"the angle {largest:g} is above {bound / math.pi:g} pi; angles are in radians"
-            hint = f"write {math.radians(largest):.4g}, if {largest:g} is in degrees"
-            yield warning_at(".".join(map(str, path)), message, hint, {"angle": largest})
-    for name, condition in evidence.subject.resolved.task.success.items():
-        bound_of_tilt = None if condition is None or condition.func != "root_tilt" else condition.at_most
-        if bound_of_tilt is not None and bound_of_tilt > math.pi:
-            message = f"the tilt {bound_of_tilt:g} is above pi, so the condition always holds; angles are in radians"
-            hint = f"write {math.radians(bound_of_tilt):.4g}, if {bound_of_tilt:g} is in degrees"
-            yield warning_at(f"success.{name}.at_most", message, hint, {"angle": bound_of_tilt})
-
-
-_SECTIONS_WITH_ANGLES = ("events", "terminations", "commands")
-
-
 def discount_of(agent: AgentConfig | None) -> float | None:
     """Return the discount factor in an agent's settings, also in nested ones; None if there is none."""
     if agent is None:
@@ -433,7 +375,7 @@ def discount_of(agent: AgentConfig | None) -> float | None:
 
 _IN_ORDER: tuple[Callable[[RolloutEvidence], Iterable[Remark]], ...] = (
     *(stops, early_resets, silent_reward, dominant_reward, constant_reward, dying_pays, constant_observation),
-    *(observation_scale, saturated_actions, dead_action, timestep, horizon, degrees),
+    *(observation_scale, saturated_actions, dead_action, timestep, horizon, degrees, joint_limits),
 )
 RULES = {rule.__name__.replace("_", "-"): rule for rule in _IN_ORDER}
 """Name -> rule, in the order in which they run; `docs/guides/check-and-lint.md` lists them.

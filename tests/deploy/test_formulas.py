@@ -99,6 +99,7 @@ TERMS = {
     "body_state_b": "bodies: [leg, shin]",
     "last_action": "",
     "generated_commands": "command: velocity",
+    "body_to_goal": "bodies: [shin], command: velocity, columns: [2, 0]",
     "current_time_s": "",
     "remaining_time_s": "",
     "sensor_data": "sensors: [gyro, quat]",

@@ -47,6 +47,7 @@ def every_term():
                 "std": [0.1, 0.1, 0.1], "zero_prob": [0.0, 0.5, 0.5]},
         "pose": {"func": "uniform_pose", "resampling_time_s": [0.04, 0.08], "bodies": ["torso"], "x": [0.0, 1.0],
                  "y": [0.0, 0.0], "z": [0.0, 0.0]},
+        "goal": {"func": "reachable_position", "resampling_time_s": [0.04, 0.08], "bodies": ["leg_fl"]},
         "place": {"func": "uniform_pose2d", "resampling_time_s": [0.04, 0.08], "x": [0.0, 1.0], "y": [0.0, 1.0]},
     }  # fmt: skip
     task["observations"]["policy"]["pos"] |= {

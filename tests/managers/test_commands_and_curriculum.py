@@ -6,10 +6,11 @@ import math
 import pytest
 import torch
 import yaml
-from support.worlds import CRITTER_TASK, PENDULUM_TASK, build, critter, dump, pendulum, run
+from support.worlds import CRITTER_TASK, PENDULUM_TASK, build, critter, dump, pendulum, run, write
 
 from rlcli.errors import ConfigError
 from rlcli.mdp.success import mean_velocity_error, mean_yaw_rate_error
+from rlcli.sim.rotations import rotate
 
 VELOCITY = {"func": "uniform_velocity", "resampling_time_s": [0.1, 0.2], "lin_vel_x": [-1.0, 1.0],
             "lin_vel_y": [-0.5, 0.5], "ang_vel_z": [-2.0, 2.0]}  # fmt: skip
@@ -261,3 +262,68 @@ def test_reset_with_seed_restarts_schedules(tmp_path):
     run(env, 8)
     assert env.reset()["policy"][:, -3].min() > 4.0  # a new episode, but the same training
     assert torch.equal(env.reset(seed=3)["policy"], first)
+
+
+ARM = """<mujoco><worldbody><body name="upper" pos="0.5 0 0.1" euler="0 0 90"><joint name="a" axis="0 1 0"/>
+<geom type="capsule" size="0.02" fromto="0 0 0 0.4 0 0" mass="0.5"/><body name="fore" pos="0.4 0 0">
+<joint name="b" axis="0 1 0" range="-90 90" limited="true"/>
+<geom type="capsule" size="0.02" fromto="0.05 0 0 0.3 0 0" mass="0.3"/>
+<body name="hand" pos="0.3 0 0"><geom size="0.03" mass="0.1"/></body></body></body></worldbody></mujoco>"""
+"""An arm whose base is turned by 90 degrees, 10 cm above the ground."""
+
+
+def reacher(tmp_path, num_envs=400, **command):
+    task = yaml.safe_load(PENDULUM_TASK)
+    task["scene"]["entities"]["robot"] = {"model": "arm.xml", "joints": {".*": {"kp": 9.0, "kv": 1.0}}}
+    task["scene"].pop("ground")
+    task["actions"] = {"joints": {"func": "joint_position"}}
+    task["observations"]["policy"] = {"goal": {"func": "generated_commands", "command": "goal"}}
+    task["commands"] = {
+        "goal": {"func": "reachable_position", "resampling_time_s": [1, 1], "bodies": "hand", **command}
+    }
+    task |= {
+        "rewards": {"slow": {"func": "joint_vel_l2", "weight": -1.0}},
+        "events": {},
+        "terminations": {"time_out": {"func": "time_out", "time_out": True}},
+    }
+    task.pop("success", None)
+    env = build(write(tmp_path / "reacher", dump(task), arm_xml=ARM), num_envs)
+    env.reset()
+    return env, env.command_manager.get_command("goal")
+
+
+def test_reachable_positions_are_within_reach_above_the_ground(tmp_path):
+    env, goals = reacher(tmp_path)
+    distance = goals.norm(dim=1)  # the base can be 0.3 + 0.4 m away, or, with the elbow at 90 degrees, 0.5 m
+    assert 0.5 - 1e-5 <= float(distance.min()) < 0.53
+    assert 0.67 < float(distance.max()) <= 0.7 + 1e-5
+    assert goals[:, 1].abs().max() < 1e-6  # in the frame of the base, the arm moves in the plane of x and z
+    assert goals[:, 2].min() > 0.03 - 0.1  # the hand, of radius 0.03 m, does not touch the ground
+    assert goals[:, 2].max() > 0.6
+    position, quat = env.entities["robot"].data.root_pos_w, env.entities["robot"].data.root_quat_w
+    seen = env.command_manager.terms[0].instance.markers()[0].center
+    assert torch.allclose(seen, position + rotate(quat, goals), atol=1e-6)
+
+
+def test_reachable_positions_have_a_free_way_from_the_default_pose(tmp_path, monkeypatch):
+    wall = '<body name="wall" pos="0.5 0 0.8"><geom type="box" size="0.1 0.25 0.4"/></body></worldbody>'
+    monkeypatch.setitem(globals(), "ARM", ARM.replace("</worldbody>", wall))
+    _, goals = reacher(tmp_path)
+    assert goals[:, 2].max() > 0.3
+    assert goals[:, 0].min() > -0.1  # the arm would have to pass through the wall to reach the other side
+
+
+def test_joint_that_an_equality_couples_follows_in_reachable_positions(tmp_path, monkeypatch):
+    tie = '<equality><joint joint1="b" joint2="a" polycoef="0 -1 0 0 0"/></equality></mujoco>'
+    monkeypatch.setitem(globals(), "ARM", ARM.replace("</mujoco>", tie))
+    _, goals = reacher(tmp_path, joints=["a"], position=[-1.0, 0.0])
+    angle = torch.atan2(goals[:, 2], goals[:, 0] - 0.3)  # the forearm stays level
+    assert (0.4 * torch.sin(angle)).allclose(goals[:, 2], atol=0.15)
+    assert float((goals[:, 0] - 0.3).square().add(goals[:, 2].square()).sub(0.16).abs().max()) < 1e-4
+
+
+def test_reachable_positions_follow_joints_and_offsets(tmp_path):
+    _, goals = reacher(tmp_path, joints=["b"], position=[-0.5, 0.0])
+    angle = torch.atan2(goals[:, 2], goals[:, 0] - 0.4)
+    assert 0.0 <= float(angle.min()) < 0.02
+    assert 0.48 < float(angle.max()) <= 0.5

@@ -134,6 +134,8 @@ OBSERVATIONS = [
         s, s.leg_pos[2], s.leg_lin[2], s.leg_ang[2], s.leg_quat[2])),
     (o.last_action, {}, lambda s: s.action),
     (o.generated_commands, {"command": "velocity"}, lambda s: s.velocity),
+    (o.body_to_goal, POSE, lambda s: s.base_R.T @ (s.goal - s.fore)),
+    (o.body_to_goal, {**POSE, "columns": [2, 0]}, lambda s: (s.base_R.T @ (s.goal - s.fore))[[2, 0]]),
     (o.generated_commands, {"command": "velocity", "columns": [2, 0]}, lambda s: [s.velocity[2], s.velocity[0]]),
     (o.current_time_s, {}, lambda s: [s.steps * 0.02]),
     (o.remaining_time_s, {}, lambda s: [0.6 - s.steps * 0.02]),

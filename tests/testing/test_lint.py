@@ -66,6 +66,22 @@ def test_degrees_finds_angles_that_are_too_large_for_radians(managed):
     assert "write 0.6109" in next(remark.hint for remark in found if "limit_angle" in remark.where)
 
 
+def test_degrees_finds_joint_positions(managed):
+    managed.config["events"]["start"]["position"] = [-10.0, 10.0]
+    managed.config["scene"]["entities"]["robot"]["init"] = {"joint_pos": {"hinge": 45.0}}
+    found = [remark.where for remark in lint(managed, only=["degrees"])]
+    assert sorted(found) == ["events.start.position", "scene.entities.robot.init.joint_pos.hinge"]
+
+
+def test_joint_limits_finds_radians_in_a_file_with_degrees_and_the_reverse(managed):
+    plain = managed.xml
+    for limits, message in (("-1.5 1.5", "no hinge with limits turns further"), ("-1800 1800", "more than two turns")):
+        managed.xml = plain.replace('name="hinge"', f'name="hinge" limited="true" range="{limits}"')
+        (remark,) = [remark for remark in lint(managed, only=["joint-limits"]) if remark.rule == "joint-limits"]
+        assert remark.where == "scene.entities.robot.model"
+        assert message in remark.message
+
+
 # --- rewards ---
 
 

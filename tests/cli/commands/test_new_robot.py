@@ -1,13 +1,17 @@
 """`rlcli new --robot`: what a task for the robot of an MJCF contains, and refused files."""
 
+import re
 import shutil
 import struct
 
 import mujoco
 import numpy as np
 import pytest
+import torch
 import yaml
 from PIL import Image
+
+from rlcli.api import make
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
 
@@ -35,8 +39,8 @@ ARM = """<mujoco><worldbody><body name="upper"><joint name="a" axis="0 1 0" rang
 </body></body></worldbody><actuator><position joint="a" kp="20" forcerange="-9 9"/><motor joint="b" gear="5"
 ctrlrange="-1 1" ctrllimited="true"/><motor joint="c" gear="2" ctrlrange="-1 1" ctrllimited="true"/></actuator></mujoco>
 """
-
-
+POINT = """<mujoco><worldbody><body name="point" pos="1 0 0" euler="0 0 90"><joint name="x" type="{kind}" axis="1 0 0"/>
+<joint name="y" type="{kind}" axis="0 1 0"/><geom size="0.1" mass="1"/></body></worldbody></mujoco>"""
 UNICYCLE = """<mujoco><worldbody><body name="frame" pos="0 0 0.15"><freejoint/>
 <geom type="capsule" fromto="0 0 0.15 0 0 0.5" size="0.03" mass="2"/><body><joint name="drive" axis="0 1 0"/>
 <geom type="ellipsoid" size="0.15 0.03 0.15" mass="1"/></body><body pos="0.06 0 0.5"><joint name="fly" axis="1 0 0"/>
@@ -104,11 +108,124 @@ def test_joints_with_different_defaults_have_a_condition_each(cli, tmp_path):
 def test_fixed_base_reaches_with_its_last_body(cli, tmp_path):
     _, task = written(cli, tmp_path, ARM)
     goal = task["commands"]["goal"]
-    assert goal["bodies"] == "hand"
-    assert 0.5 < goal["z"][0] < goal["z"][1] <= 0.7
+    assert (goal["func"], goal["bodies"], goal["joints"]) == ("reachable_position", "hand", ["a", "b", "c"])
+    assert task["actions"]["joint_position"]["scale"] == {"a": 0.785, "b": 0.785, "c": 0.785}
+    assert task["success"]["position"]["at_most"] == pytest.approx(0.025 * 1.2, rel=0.2)  # goals are within 1.2 m
     # gains of the motors follow from their efforts; the position actuator keeps its own
     joints = task["scene"]["entities"]["robot"]["joints"]
     assert {name: values["effort_limit"] for name, values in joints.items()} == {"b": 5.0, "c": 2.0}
+
+
+@pytest.mark.parametrize("text", [ARM, POINT.format(kind="slide")], ids=["arm", "point"])
+def test_untrained_policies_seldom_reach_the_goals(cli, tmp_path, text):
+    written(cli, tmp_path, text)
+    for policy in ("zero", "random"):
+        result = cli(
+            "eval", "my-robot/my_robot", "--policy", policy, "--episodes", "300", "--num-envs", "300", "--json"
+        )
+        assert result.code == 0, result.err
+        assert result.json["success"]["rate"] <= 0.02
+
+
+@pytest.mark.parametrize("size", [1.0, 0.2])
+def test_an_arm_reaches_its_goals_if_its_joints_are_at_their_targets(cli, tmp_path, size):
+    """Gravity displaces the hand by less than the tolerance of the success, for arms of any size."""
+    text = ARM[: ARM.index("<actuator>")] + "</mujoco>"
+    for length in ("0.4", "0.3", "0.02", "0.03"):
+        text = re.sub(rf"\b{length}\b", f"{float(length) * size:g}", text)
+    _, task = written(cli, tmp_path, text)
+    env, generator = make("my-robot/my_robot", num_envs=64), np.random.default_rng(0)
+    model = mujoco.MjModel.from_xml_path("my-robot/my_robot/model.xml")
+    plan, hands, targets = mujoco.MjData(model), [], generator.uniform(-1.0, 1.0, (64, 3))
+    for angles in targets:
+        plan.qpos[:] = angles
+        mujoco.mj_kinematics(model, plan)
+        hands.append(plan.body("hand").xpos.copy())
+    env.reset()
+    scales = [task["actions"]["joint_position"]["scale"][name] for name in "abc"]
+    for _ in range(100):
+        env.step(torch.tensor(targets / scales, dtype=torch.float32))
+    goal = env.command_manager.get_term("goal")
+    goal.command.copy_(torch.tensor(np.array(hands)))
+    env.step(torch.tensor(targets / scales, dtype=torch.float32))
+    assert float(goal.metrics()["position_error"].quantile(0.9)) < task["success"]["position"]["at_most"]
+
+
+def test_an_arm_without_a_keyframe_starts_away_from_its_limits(cli, tmp_path):
+    text = ARM.replace('axis="1 0 0" range="-90 90"', 'axis="1 0 0" range="0 150"')
+    _, task = written(cli, tmp_path, text)
+    assert task["scene"]["entities"]["robot"]["init"] == {"joint_pos": {"b": 1.31}}
+    shutil.rmtree(tmp_path / "my-robot")
+    _, task = written(cli, tmp_path, text.replace("</mujoco>", '<keyframe><key qpos="0 0.1 0"/></keyframe></mujoco>'))
+    assert task["scene"]["entities"]["robot"]["init"] == {"joint_pos": {"b": 0.1}}
+
+
+def test_a_finger_that_follows_another_one_is_not_driven(cli, tmp_path):
+    finger = (
+        '<body pos="0 {y} 0"><joint name="{name}" type="slide" axis="0 1 0" range="-0.04 0"/><geom size="0.01"/></body>'
+    )
+    fingers = finger.format(y=0.05, name="left") + finger.format(y=-0.05, name="right")
+    text = ARM[: ARM.index("<actuator>")].replace("</body>\n</body></body>", fingers + "</body>\n</body></body>")
+    tie = '<equality><joint joint1="right" joint2="left" polycoef="0 -1 0 0 0"/></equality></mujoco>'
+    result, task = written(cli, tmp_path, text + tie)
+    assert result.json["flavour"] == "reach"
+    assert task["actions"]["joint_position"]["joints"] == ["a", "b", "c", "left"]
+    assert task["scene"]["entities"]["robot"]["init"]["joint_pos"] == {"left": -0.02, "right": 0.02}
+
+
+def test_only_reaching_changes_the_usual_time_step(cli, tmp_path):
+    for text, expected in (
+        (ARM, (0.005, 4)),
+        (ARM.replace("<worldbody>", '<option timestep="0.001"/><worldbody>'), (0.001, 20)),
+        (ARM.replace('kp="20"', 'kp="90000"'), (0.002, 10)),  # a servo that is too fast for a longer step
+        (DOG, (0.002, 10)),
+    ):
+        _, task = written(cli, tmp_path, text)
+        assert (task["sim"]["dt"], task["decimation"]) == expected
+        shutil.rmtree(tmp_path / "my-robot")
+
+
+def test_the_reason_for_the_kind_is_printed(cli, tmp_path):
+    for text, kind, reason in (
+        (DOG, "velocity", "its base floats, it has 4 feet and 4 driven joints"),
+        (CART, "balance", "its base is fixed, but 1 of its joints have no actuator of their own (hinge)"),
+        (ARM, "reach", "its base is fixed, and all of its 3 joints are driven"),
+        (POINT.format(kind="hinge"), "balance", "its joints do not move its last body 'point' by more than 1 cm"),
+        (UNICYCLE, "balance", "only 2 driven joints"),
+        (DOG.replace("<worldbody>", '<option gravity="0 0 0"/><worldbody>'), "balance", "there is no gravity"),
+    ):
+        result, _ = written(cli, tmp_path, text)
+        assert f"task: {kind}, because" in result.err
+        assert reason in result.err
+        shutil.rmtree(tmp_path / "my-robot")
+
+
+def test_the_kind_can_be_chosen(cli, tmp_path):
+    (tmp_path / "robot.xml").write_text(CART)
+    result = cli("new", "my-robot", "--robot", "robot.xml", "--kind", "reach", "--json")
+    assert (result.code, result.json["flavour"]) == (0, "reach")
+    assert "task: reach, because --kind says so; without it balance" in result.err
+    assert cli("validate", "--deep", "my-robot/my_robot").code == 0
+    for kind, message in (
+        ("velocity", "impossible for robot.xml: its base is fixed"),
+        ("walk", "no kind of task 'walk'"),
+    ):
+        refused = cli("new", "other-robot", "--robot", "robot.xml", "--kind", kind)
+        assert (refused.code, message in refused.err) == (2, True), refused.err
+    assert "--kind needs --robot" in cli("new", "other-robot", "--kind", "reach").err
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("<worldbody>", '<compiler angle="radian"/><worldbody>', "joint 'a' has the limits -90 to 90 rad"),
+        ('range="-90 90"', 'range="-1.5 1.5"', "no hinge with limits turns further than 6.28 degrees"),
+        ("</mujoco>", '<keyframe><key qpos="0 45 0"/></keyframe></mujoco>', "has joint 'b' at 45 rad"),
+    ],
+)
+def test_angles_in_a_wrong_unit_are_reported(cli, tmp_path, old, new, message):
+    result, _ = written(cli, tmp_path, ARM.replace(old, new))
+    assert message in result.err
 
 
 def test_default_pose_is_that_of_numeric_init_qpos(cli, tmp_path):
@@ -220,15 +337,8 @@ def test_robot_that_is_listed_after_an_object_is_the_root(cli, tmp_path):
     assert model.body("ball").pos.tolist() == [1.0, 0.0, 0.2]
 
 
-POINT = """<mujoco><worldbody><body name="point" pos="1 0 0" euler="0 0 90"><joint name="x" type="{kind}" axis="1 0 0"/>
-<joint name="y" type="{kind}" axis="0 1 0"/><geom size="0.1" mass="1"/></body></worldbody></mujoco>"""
-
-
-def test_goals_are_in_the_frame_of_a_root_that_moves_itself(cli, tmp_path):
+def test_goals_on_a_plane_have_two_columns(cli, tmp_path):
     _, task = written(cli, tmp_path, POINT.format(kind="slide"))
-    goal = task["commands"]["goal"]
-    assert goal["x"] == pytest.approx([-0.06, 0.06], abs=0.02)
-    assert goal["y"] == pytest.approx([-0.06, 0.06], abs=0.02)
     assert task["observations"]["policy"]["goal"]["columns"] == [0, 1]
 
 

@@ -1,0 +1,134 @@
+"""Copy of a robot's MJCF for a new task: without ground, lights and keyframes, with names and asset files."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from xml.etree import ElementTree
+
+import mujoco
+import numpy as np
+
+SCALAR = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+"""Joint types with one position: hinge and slide."""
+FREE = int(mujoco.mjtJoint.mjJNT_FREE)
+"""Joint type of a floating base."""
+
+
+def default_pose(spec: mujoco.MjSpec) -> np.ndarray | None:
+    """Return the robot's default pose as `qpos` (nq,), or None if the MJCF has no default pose.
+
+    It is the pose of the keyframe `home` or `stand`, else of the first keyframe, else the value of the element
+    `numeric` with the name `init_qpos`.
+    """
+    keys = sorted(spec.keys, key=lambda key: key.name not in ("home", "stand", "standing"))
+    start = next((numeric for numeric in spec.numerics if numeric.name == "init_qpos"), None)  # a habit of Gymnasium
+    if keys:
+        return np.array(keys[0].qpos)
+    return None if start is None else np.array(start.data)
+
+
+def remove_scene_elements(spec: mujoco.MjSpec) -> None:
+    """Remove ground, lights and keyframes, which the task defines itself; name all bodies, joints and actuators.
+
+    Welds and connections to mocap bodies are removed, too: a task does not move mocap bodies, so they would hold the
+    robot. If all actuators pull at tendons, they are removed, and the task drives the joints directly.
+    """
+    if all(actuator.trntype == mujoco.mjtTrn.mjTRN_TENDON for actuator in spec.actuators):
+        measured = [sensor for sensor in spec.sensors if sensor.objtype == mujoco.mjtObj.mjOBJ_ACTUATOR]
+        for element in (*measured, *list(spec.actuators)):
+            spec.delete(element)
+    for key in list(spec.keys):
+        spec.delete(key)
+    mocap = {body.name for body in spec.bodies if body.mocap}
+    mocap |= {site.name for site in spec.sites if site.parent.mocap}
+    for tie in list(spec.equalities):
+        if tie.type in (mujoco.mjtEq.mjEQ_WELD, mujoco.mjtEq.mjEQ_CONNECT) and {tie.name1, tie.name2} & mocap:
+            spec.delete(tie)
+    world = spec.worldbody
+    for geom in list(world.geoms):
+        if geom.type in (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD):
+            spec.delete(geom)
+    for light in list(spec.lights):
+        spec.delete(light)
+    for kind, elements in (("body", spec.bodies[1:]), ("joint", spec.joints), ("actuator", spec.actuators)):
+        taken = {element.name for element in elements}
+        for number, element in enumerate(elements):
+            if not element.name:
+                element.name = next(n for i in range(number, 10**6) if (n := f"{kind}{i}") not in taken)
+                taken.add(element.name)
+
+
+def put_robot_first(tree: ElementTree.Element, model: mujoco.MjModel) -> None:
+    """Make the top-level body with most driven joints the first one, because rlcli takes the first body as the root.
+
+    If the body has a free joint, it is placed at the origin. If its z axis does not point up, `_insert_level_root`
+    gives it a parent whose z axis does.
+    """
+    joint_actuator = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)
+    driven = model.actuator_trnid[joint_actuator, 0] if model.nu else np.flatnonzero(np.isin(model.jnt_type, SCALAR))
+    world, bodies = tree.find("worldbody"), tree.findall("worldbody/body")
+    if world is None or not len(driven):
+        return
+    root = int(np.bincount(model.body_rootid[model.jnt_bodyid[driven]]).argmax())
+    robot = next(body for body in bodies if body.get("name") == model.body(root).name)
+    begin = list(world).index(bodies[0])
+    world.remove(robot)
+    world.insert(begin, robot)
+    if model.body_dofnum[root] < 6 or model.jnt_type[model.body_jntadr[root]] != FREE:
+        return
+    for body in bodies:  # other bodies keep their place relative to the robot
+        place = model.body(body.get("name")).pos - model.body_pos[root]
+        body.set("pos", " ".join(f"{value:.6g}" for value in place))
+    if 1.0 - 2.0 * float(np.square(model.body_quat[root, 1:3]).sum()) < 0.95:  # its z axis is not up
+        _insert_level_root(robot)
+
+
+def _insert_level_root(body: ElementTree.Element) -> None:
+    """Give a free body a new parent with the free joint, whose z axis points up: terms read the tilt of the root.
+
+    The element of the body becomes the new parent, and a copy of the body its child.
+    """
+    child = ElementTree.Element("body", body.attrib | {"pos": "0 0 0"})
+    joints = [part for part in body if part.tag == "freejoint" or part.get("type") == "free"]
+    child.extend([part for part in body if part not in joints])
+    kept = {key: value for key, value in body.attrib.items() if key in ("childclass", "pos")}
+    body.clear()
+    body.attrib.update(kept, name=f"{child.attrib['name']}_level")
+    body.extend([*joints, child])
+
+
+def collect_assets(tree: ElementTree.Element, spec: mujoco.MjSpec, file: Path) -> dict[str, Path]:
+    """Change the paths of all files that an MJCF loads to the folder `assets`; return new path -> present file."""
+    found: dict[str, Path] = {}
+    home = Path(spec.modelfiledir or file.parent)
+    for element in tree.iter():
+        for key in [key for key in element.attrib if key.startswith("file") and element.tag != "text"]:
+            name = element.attrib[key]
+            folder = spec.texturedir if element.tag == "texture" else spec.meshdir
+            origin = next((path for path in (home / folder / name, home / name) if path.is_file()), None)
+            if origin is None:
+                raise ValueError(f"a {element.tag} loads {home / folder / name}, which does not exist; move it there")
+            place = f"assets/{origin.name}"
+            for number in range(len(found)):  # another file may have the same name
+                if found.get(place, origin).resolve() == origin.resolve():
+                    break
+                place = f"assets/{number}_{origin.name}"
+            found[place] = origin
+            element.set(key, Path(place).name)
+    compiler = tree.find("compiler")
+    if compiler is None:
+        compiler = ElementTree.SubElement(tree, "compiler")
+    for key in ("assetdir", "strippath"):
+        compiler.attrib.pop(key, None)
+    compiler.attrib.update(meshdir="assets", texturedir="assets")
+    return found
+
+
+def compile_copy(xml: str, assets: Mapping[str, Path]) -> mujoco.MjModel:
+    """Compile an MJCF text with the files `assets` (path in the MJCF -> file), which are given to MuJoCo in memory.
+
+    Raises:
+        ValueError: if MuJoCo cannot compile it, for example because it needs a further file.
+    """
+    return mujoco.MjModel.from_xml_string(xml, {place: origin.read_bytes() for place, origin in assets.items()})

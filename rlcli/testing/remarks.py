@@ -1,0 +1,40 @@
+"""Remarks of the lint rules."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from typing import Any, Literal
+
+
+@dataclass(frozen=True, slots=True)
+class Remark:
+    """Finding of a lint rule: a property of a task that makes learning hard."""
+
+    rule: str
+    """Name of the rule."""
+    severity: Literal["error", "warning"]
+    where: str
+    """Term, column or setting."""
+    message: str
+    """What was found."""
+    hint: str
+    """What to do."""
+    numbers: dict[str, float] = field(default_factory=dict)
+    """Measured values by name."""
+
+    def __str__(self) -> str:
+        """Return the remark as one line."""
+        return f"{self.severity}: {self.rule}: {self.where}: {self.message}; {self.hint}"
+
+    def record(self) -> dict[str, Any]:
+        """Return the remark as JSON, which has no infinity: such numbers become null."""
+        numbers = {name: value if math.isfinite(value) else None for name, value in self.numbers.items()}
+        return {**asdict(self), "numbers": numbers}
+
+
+error_at = partial(Remark, "", "error")
+"""(where, message, hint, numbers) -> error of the running rule; the linter adds the name of the rule."""
+warning_at = partial(Remark, "", "warning")
+"""(where, message, hint, numbers) -> warning of the running rule; the linter adds the name of the rule."""
