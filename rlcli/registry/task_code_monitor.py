@@ -163,11 +163,11 @@ def observe_task_code() -> Iterator[None]:
     def on_error(other: Callable[[Any], Any]) -> Callable[[Any], None]:
         def hook(found: Any) -> None:
             frames = [each for each in traceback.walk_tb(found.exc_traceback) if is_task_code(each[0])]
-            if found.exc_value is None or not frames:
+            place = f"{frames[-1][0].f_code.co_filename}:{frames[-1][1]}" if frames else place_in_task(sys._getframe(1))
+            if found.exc_value is None or place is None:
                 other(found)
-            elif not isinstance(found.exc_value, SystemExit):
-                text = f"error in a thread or destructor: {error_with_type(found.exc_value)}"
-                report(f"{frames[-1][0].f_code.co_filename}:{frames[-1][1]}", text)
+            elif not (isinstance(found.exc_value, SystemExit) and hasattr(found, "thread")):  # which ends its thread
+                report(place, f"error in a thread or destructor: {error_with_type(found.exc_value)}")
 
         return hook
 

@@ -116,6 +116,17 @@ def test_error_in_a_thread_of_a_task_is_one_line(with_code, cli):
     assert f"coin/task.py:{line}: error in a thread or destructor: ZeroDivisionError: division by zero" in found.err
 
 
+@pytest.mark.parametrize(
+    "code", ["type('X', (), {'__del__': lambda self: os._exit(3)})()", "finalize(X(), sys.exit, 3)"]
+)
+def test_exit_in_a_destructor_of_a_task_is_one_line(with_code, start, code):
+    made = "X = type('X', (), {})" if "finalize" in code else "pass"
+    line = with_code("calculate_metrics", f"import sys; from weakref import finalize; {made}; {code}")
+    err = stderr_of(start(*EVAL))
+    assert err.count(f"coin/task.py:{line}: error in a thread or destructor: SystemExit: ") == 1, err
+    assert "Exception ignored" not in err
+
+
 ERRORS = {
     "open('/no/such')": "FileNotFoundError: [Errno 2] No such file or directory: '/no/such'",
     "open('x' * 300)": "OSError: [Errno 36] File name too long: ",
