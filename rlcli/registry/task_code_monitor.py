@@ -3,6 +3,7 @@
 import builtins
 import contextlib
 import functools
+import gc
 import linecache
 import logging
 import os
@@ -221,8 +222,30 @@ def _frames_of_command(frame: FrameType | None) -> Iterator[FrameType]:
 
 def place_in_task(frame: FrameType | None) -> str | None:
     """Return file and line of the innermost code of a task that runs in a frame or its callers."""
-    inner = next((each for each in _frames_of_command(frame) if is_task_code(each)), None)
+    return _innermost_place(_frames_of_command(frame))
+
+
+def _innermost_place(frames: Iterable[FrameType]) -> str | None:
+    inner = next((each for each in frames if is_task_code(each)), None)
     return None if inner is None else f"{inner.f_code.co_filename}:{inner.f_lineno}"
+
+
+def frames_of_thread(thread: int | None) -> list[FrameType]:
+    """Return the frames of a thread, innermost first, up to the start of the command.
+
+    The garbage collector is off meanwhile: Python 3.11 collects inside of `f_back`. If a finalizer then lets the thread
+    continue, `f_back` reads freed memory, and the process may crash.
+
+    Args:
+        thread: identifier of the thread.
+    """
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        return list(_frames_of_command(sys._current_frames().get(thread or 0)))
+    finally:
+        if was_enabled:
+            gc.enable()
 
 
 @contextlib.contextmanager
@@ -254,9 +277,8 @@ def exit_refused() -> Iterator[None]:
 def report_lasting_threads() -> None:
     """Warn of threads of a task that have not ended `SLOW_S` after the command: the process waits for them."""
     end = time.monotonic() + SLOW_S
-    frames = sys._current_frames()
     for thread in threading.enumerate():
-        place = place_in_task(frames.get(thread.ident or 0))
+        place = _innermost_place(frames_of_thread(thread.ident))
         if place and not thread.daemon and thread is not threading.main_thread():
             thread.join(max(0.0, end - time.monotonic()))
             if thread.is_alive():
@@ -284,7 +306,7 @@ class _Watch(threading.Thread):
         """Look at the running code until `end` is called."""
         since: dict[FrameType, float] = {}  # the keys keep the frames, so that no new one has the same identity
         while not self._ended.wait(_SAMPLE_S):
-            frames = list(_frames_of_command(sys._current_frames().get(self._watched)))
+            frames = frames_of_thread(self._watched)
             now = time.monotonic()
             since = {frame: since.get(frame, now) for frame in _calls(frames)}
             call = next((frame for frame, begin in since.items() if now - begin >= SLOW_S - _SAMPLE_S), None)
