@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import builtins
 import errno
 import functools
 import importlib
@@ -35,8 +36,15 @@ from rlcli.errors import (
 from rlcli.machine.garbage_collection import delay_garbage_collection
 from rlcli.machine.memory import memory_error
 from rlcli.registry import OWN, TRAINERS, catalog, load_entry, load_object, malformed_metadata_ignored
-from rlcli.registry.plugin_imports import exit_refused
-from rlcli.registry.task_code_monitor import error_of_task, observe_task_code, place_in_task, raised_by_task
+from rlcli.registry.task_code_monitor import (
+    error_of_task,
+    exit_refused,
+    observe_task_code,
+    place_in_task,
+    raised_by_task,
+    report_lasting_threads,
+    restore_built_in,
+)
 from rlcli.safe_text import remember_given
 from rlcli.settings import settings_file, use_settings
 from rlcli.trainers import TrainerSpec
@@ -132,6 +140,8 @@ def main(arguments: list[str] | None = None) -> int:
             sys.stdout.flush()
     except OSError:
         redirect_to_null(sys.stdout)
+    if console.owns_process:
+        report_lasting_threads()
     return code
 
 
@@ -180,11 +190,16 @@ def _require_words(arguments: list[str]) -> None:
 
 
 def _run(arguments: list[str]) -> int:
+    built_in = vars(builtins).copy()
+    broken: TaskError | None = None
     try:
         _require_words(arguments)
         _require_folder_and_output()
         with use_settings(_user_settings(arguments)):
-            result = build(_command_name(arguments))(arguments, prog_name="rlcli", standalone_mode=False)
+            try:
+                result = build(_command_name(arguments))(arguments, prog_name="rlcli", standalone_mode=False)
+            finally:
+                broken = restore_built_in(built_in)
         if result == INTERRUPTED:  # typer turns Ctrl-C into this exit code
             raise KeyboardInterrupt
         return result if isinstance(result, int) else 0
@@ -197,6 +212,8 @@ def _run(arguments: list[str]) -> int:
     except BaseException as raised:  # the code of a task may raise any exception
         cause = raised.error if isinstance(raised, BodyError) else raised
         failure = _as_rlcli_error(cause, arguments)
+        if failure.kind == "bug" and broken is not None:
+            failure = broken
         if failure.kind == "bug" and isinstance(cause, SystemExit):
             raise  # not from the code of a task or plugin: typer ends completions and closed pipes in this way
         is_expected = isinstance(cause, ClickException | KeyboardInterrupt | typer.Abort)

@@ -9,11 +9,10 @@ import os
 import re
 import reprlib
 import sys
-import threading
 import traceback
 from collections.abc import Callable, Iterator
 from importlib import metadata
-from typing import Any, NoReturn, TypeVar
+from typing import Any, TypeVar
 
 from rlcli.errors import DependencyError, RlcliError, TaskError, listing, pip_install, short_error
 from rlcli.formats import FormatSpec
@@ -123,26 +122,6 @@ def _plugin_named(entry: Entry, failure: str, passed_on: type[RlcliError]) -> It
             or f"update or uninstall {entry.distribution}; as its author, correct its code or its entry point in"
             " pyproject.toml, and install it again",
         ) from error
-
-
-@contextlib.contextmanager
-def exit_refused() -> Iterator[None]:
-    """Make `os._exit` an error in the `with` block: code of a plugin would end the command without a message.
-
-    Other processes, such as children that a library forks, and other threads still end.
-    """
-    before, process, thread = os._exit, os.getpid(), threading.get_ident()
-
-    def refuse(status: int) -> NoReturn:
-        if (os.getpid(), threading.get_ident()) != (process, thread):
-            before(status)
-        raise SystemExit(f"it called os._exit({status})")
-
-    os._exit = refuse
-    try:
-        yield
-    finally:
-        os._exit = before
 
 
 def import_object(reference: str) -> Any:

@@ -1,8 +1,13 @@
 """Reports about the code of tasks and plugins while a command runs: its errors, its warnings, and calls that hang."""
 
+import builtins
 import contextlib
 import functools
+import gc
+import linecache
 import logging
+import os
+import re
 import sys
 import sysconfig
 import threading
@@ -12,10 +17,10 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from types import CodeType, FrameType
-from typing import Any
+from typing import Any, NoReturn
 
 import rlcli
-from rlcli.errors import TaskError, error_text, error_with_type, short_error
+from rlcli.errors import TaskError, error_text, error_with_type, listing, short_error
 from rlcli.registry.entries import FORMATS, OWN, TASKS, TRAINERS, Entry, catalog
 from rlcli.registry.formats import is_framework
 from rlcli.safe_text import shorten
@@ -28,6 +33,7 @@ _SAMPLE_S = 1.0
 """Time between two looks at the running code [s]."""
 _MOST_TEXT = 200
 """Longest text of a warning [characters]."""
+_BUILT_IN = vars(builtins)
 _ENTRIES = ("rlcli.cli.app", "rlcli.envs.sharding.worker")
 """Modules that start a command or a worker: the frames that called them belong to the program that uses rlcli."""
 
@@ -68,6 +74,35 @@ def raised_by_task(error: BaseException) -> bool:
     frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
     own = [frame for frame in frames if is_task_code(frame) or is_framework(_module(frame))]
     return bool(own) and is_task_code(own[-1])
+
+
+def restore_built_in(before: dict[str, Any]) -> TaskError | None:
+    """Restore the built-in functions that code of a task has deleted or replaced; return an error that names them.
+
+    No built-in function is called until they are restored.
+
+    Args:
+        before: a copy of `vars(builtins)` from before the task's code ran.
+    """
+    changed = [name for name in before if _BUILT_IN.get(name) is not before[name]]
+    if not changed:
+        return None
+    _BUILT_IN.update(before)
+    return TaskError(
+        f"{next(_uses_of_builtins(), '')}code of the task has deleted or replaced the built-in"
+        f" functions {listing(changed, limit=3)}",
+        hint="remove the assignment to `builtins` from the task's code; --debug shows the traceback",
+    )
+
+
+def _uses_of_builtins() -> Iterator[str]:
+    """Yield file and line of the uses of `builtins` in the code of tasks and plugins."""
+    for name, module in list(sys.modules.items()):
+        file = getattr(module, "__file__", None)
+        if isinstance(file, str) and _is_task_file(file, name.partition(".")[0]):
+            for number, line in enumerate(linecache.getlines(file), 1):
+                if re.search(r"(?<!import )\b(__)?builtins(__)?\b", line):
+                    yield f"{file}:{number}: "
 
 
 def is_task_code(frame: FrameType) -> bool:
@@ -129,11 +164,11 @@ def observe_task_code() -> Iterator[None]:
     def on_error(other: Callable[[Any], Any]) -> Callable[[Any], None]:
         def hook(found: Any) -> None:
             frames = [each for each in traceback.walk_tb(found.exc_traceback) if is_task_code(each[0])]
-            if found.exc_value is None or not frames:
+            place = f"{frames[-1][0].f_code.co_filename}:{frames[-1][1]}" if frames else place_in_task(sys._getframe(1))
+            if found.exc_value is None or place is None:
                 other(found)
-            elif not isinstance(found.exc_value, SystemExit):
-                text = f"error in a thread or destructor: {error_with_type(found.exc_value)}"
-                report(f"{frames[-1][0].f_code.co_filename}:{frames[-1][1]}", text)
+            elif not (isinstance(found.exc_value, SystemExit) and hasattr(found, "thread")):  # which ends its thread
+                report(place, f"error in a thread or destructor: {error_with_type(found.exc_value)}")
 
         return hook
 
@@ -187,8 +222,67 @@ def _frames_of_command(frame: FrameType | None) -> Iterator[FrameType]:
 
 def place_in_task(frame: FrameType | None) -> str | None:
     """Return file and line of the innermost code of a task that runs in a frame or its callers."""
-    inner = next((each for each in _frames_of_command(frame) if is_task_code(each)), None)
+    return _innermost_place(_frames_of_command(frame))
+
+
+def _innermost_place(frames: Iterable[FrameType]) -> str | None:
+    inner = next((each for each in frames if is_task_code(each)), None)
     return None if inner is None else f"{inner.f_code.co_filename}:{inner.f_lineno}"
+
+
+def frames_of_thread(thread: int | None) -> list[FrameType]:
+    """Return the frames of a thread, innermost first, up to the start of the command.
+
+    The garbage collector is off meanwhile: Python 3.11 collects inside of `f_back`. If a finalizer then lets the thread
+    continue, `f_back` reads freed memory, and the process may crash.
+
+    Args:
+        thread: identifier of the thread.
+    """
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        return list(_frames_of_command(sys._current_frames().get(thread or 0)))
+    finally:
+        if was_enabled:
+            gc.enable()
+
+
+@contextlib.contextmanager
+def exit_refused() -> Iterator[None]:
+    """Make `os._exit` an error in the `with` block: code of a plugin would end the command without a message.
+
+    Other processes, such as children that a library forks, still end. Another thread ends the command, with a message
+    if it runs code of a task.
+    """
+    before, process, thread = os._exit, os.getpid(), threading.get_ident()
+
+    def refuse(status: int) -> NoReturn:
+        if os.getpid() != process:
+            before(status)
+        if threading.get_ident() != thread:
+            place = place_in_task(sys._getframe(1))
+            if place is not None:
+                warn_once(f"{place}: a thread has ended the command with os._exit({status})")
+            before(status if place is None else TaskError.exit_code)
+        raise SystemExit(f"it called os._exit({status})")
+
+    os._exit = refuse
+    try:
+        yield
+    finally:
+        os._exit = before
+
+
+def report_lasting_threads() -> None:
+    """Warn of threads of a task that have not ended `SLOW_S` after the command: the process waits for them."""
+    end = time.monotonic() + SLOW_S
+    for thread in threading.enumerate():
+        place = _innermost_place(frames_of_thread(thread.ident))
+        if place and not thread.daemon and thread is not threading.main_thread():
+            thread.join(max(0.0, end - time.monotonic()))
+            if thread.is_alive():
+                warn_once(f"{place}: a thread still runs {SLOW_S:g} s after the end of the command; Ctrl-C ends it")
 
 
 class _Watch(threading.Thread):
@@ -212,7 +306,7 @@ class _Watch(threading.Thread):
         """Look at the running code until `end` is called."""
         since: dict[FrameType, float] = {}  # the keys keep the frames, so that no new one has the same identity
         while not self._ended.wait(_SAMPLE_S):
-            frames = list(_frames_of_command(sys._current_frames().get(self._watched)))
+            frames = frames_of_thread(self._watched)
             now = time.monotonic()
             since = {frame: since.get(frame, now) for frame in _calls(frames)}
             call = next((frame for frame, begin in since.items() if now - begin >= SLOW_S - _SAMPLE_S), None)

@@ -237,6 +237,11 @@ def _find_run(reference: str, runs_dir: Path, task: str | None) -> tuple[Run, st
     for folder, error in broken.items():
         if folder.name == reference:
             raise error
+    if os.path.isfile(path_of(reference)):
+        raise CheckpointError(
+            f"'{reference}' is a file, not the folder of a run, a checkpoint or a bundle",
+            hint="of exported policies, rlcli reads only bundles: rlcli export --format bundle",
+        )
     folders = [run.folder.parent if (run.folder.parent / STUDY).is_file() else run.folder for run in runs]
     names = list(dict.fromkeys(folder.name for folder in folders))
     named = [repr(name) for name in names if name.endswith(f"-{reference}")]  # a folder's name is TIME-NAME

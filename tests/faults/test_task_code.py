@@ -116,6 +116,17 @@ def test_error_in_a_thread_of_a_task_is_one_line(with_code, cli):
     assert f"coin/task.py:{line}: error in a thread or destructor: ZeroDivisionError: division by zero" in found.err
 
 
+@pytest.mark.parametrize(
+    "code", ["type('X', (), {'__del__': lambda self: os._exit(3)})()", "finalize(X(), sys.exit, 3)"]
+)
+def test_exit_in_a_destructor_of_a_task_is_one_line(with_code, start, code):
+    made = "X = type('X', (), {})" if "finalize" in code else "pass"
+    line = with_code("calculate_metrics", f"import sys; from weakref import finalize; {made}; {code}")
+    err = stderr_of(start(*EVAL))
+    assert err.count(f"coin/task.py:{line}: error in a thread or destructor: SystemExit: ") == 1, err
+    assert "Exception ignored" not in err
+
+
 ERRORS = {
     "open('/no/such')": "FileNotFoundError: [Errno 2] No such file or directory: '/no/such'",
     "open('x' * 300)": "OSError: [Errno 36] File name too long: ",
@@ -160,6 +171,43 @@ def test_import_that_breaks_built_in_functions_is_an_error(coin, tmp_path, start
     assert "Traceback" not in err
     assert "replaced the built-in functions" in err
     assert "coin/task.py" in err.splitlines()[-1] + err.splitlines()[-2]
+
+
+BREAKS = {
+    "vars(builtins).update(len=None, print=None)": "len, print",
+    "[vars(builtins).pop(name) for name in ('isinstance', 'type')]": "isinstance, type",
+    "vars(builtins).update(isinstance=lambda *_: False)": "isinstance",
+    "vars(builtins).update(__import__=None)": "__import__",
+    "vars(builtins).clear()": "__name__, __doc__, __package__",
+}
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("code", BREAKS)
+def test_hook_that_breaks_built_in_functions_is_named(with_code, start, workers, code):
+    guard = "self.env.shard.first and " if workers == 2 else ""
+    line = with_code("calculate_metrics", f"import builtins; {guard}{code}", f"num_envs: 32, workers: {workers}")
+    process = start(*TRAIN)
+    _, err = process.communicate()
+    assert process.returncode == 4, err
+    assert "Traceback" not in err
+    found = f"code of the task has deleted or replaced the built-in functions {BREAKS[code]}"
+    assert f"coin/task.py:{line}: {found}" in err
+
+
+def test_thread_of_a_task_that_ends_the_command_is_named(with_code, start):
+    line = with_code("calculate_metrics", "t = threading.Thread(target=lambda: os._exit(0)); t.start(); t.join()")
+    process = start(*EVAL)
+    _, err = process.communicate()
+    assert process.returncode == 4, err
+    assert err.endswith(f"coin/task.py:{line}: a thread has ended the command with os._exit(0)\n")
+
+
+@pytest.mark.slow
+def test_thread_of_a_task_that_outlasts_the_command_is_named(with_code, start):
+    line = with_code("reset_idx", "threading.Thread(target=lambda: time.sleep(15)).start()")
+    err = stderr_of(start(*EVAL))
+    assert f"coin/task.py:{line}: a thread still runs 10 s after the end of the command" in err
 
 
 def test_timer_of_a_task_is_named(with_code, start):

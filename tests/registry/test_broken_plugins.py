@@ -13,8 +13,8 @@ import torch
 from support.broken_plugins import BROKEN, FILES
 
 from rlcli.registry import catalog
-from rlcli.registry.plugin_imports import exit_refused
 from rlcli.registry.probe import probe
+from rlcli.registry.task_code_monitor import exit_refused
 
 pytestmark = pytest.mark.processes
 BUILT_IN = {"cartpole", "cartpole-direct", "ant-direct"}

@@ -135,6 +135,13 @@ def test_find_run_refuses_a_too_long_name(tmp_path):
         find_checkpoint("a" * 5000, tmp_path)
 
 
+def test_find_run_refuses_a_file(tmp_path):
+    (tmp_path / "policy.onnx").touch()
+    with pytest.raises(CheckpointError, match=r"policy.onnx' is a file, not the folder of a run") as caught:
+        find_checkpoint(str(tmp_path / "policy.onnx"), tmp_path)
+    assert "rlcli export --format bundle" in caught.value.hint
+
+
 def test_find_run_without_runs_has_a_hint(tmp_path):
     with pytest.raises(CheckpointError, match="no run of cartpole") as caught:
         find_run("latest", tmp_path / "nowhere", "cartpole")

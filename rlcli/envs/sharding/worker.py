@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import builtins
 import contextlib
 import logging
 import os
@@ -9,6 +10,7 @@ import pickle
 import random
 import signal
 import socket
+import sys
 import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -18,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 from rlcli.envs.sharding.channel import SPIN_S, Channel, ChannelClosedError
 from rlcli.errors import RlcliError, TaskError
 from rlcli.machine.memory import memory_error
-from rlcli.registry.task_code_monitor import error_of_task, observe_task_code
+from rlcli.registry.task_code_monitor import error_of_task, observe_task_code, restore_built_in
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -101,6 +103,7 @@ def _serve(channel: Channel, arrays: int) -> None:
 
     torch.set_num_threads(1)
     worker = _Worker(channel, arrays)
+    built_in = vars(builtins).copy()
     with torch.no_grad():
         while True:
             kind, content = channel.receive()
@@ -108,8 +111,11 @@ def _serve(channel: Channel, arrays: int) -> None:
                 worker.handle(kind, content)
             except ChannelClosedError:
                 raise
-            except BaseException as error:
-                channel.send(ERROR, _PortableError.from_exception(error))
+            except:  # noqa: E722 - the task may have deleted the name BaseException
+                broken = restore_built_in(built_in)
+                error = sys.exception()
+                assert error is not None
+                channel.send(ERROR, _PortableError.from_exception(error, broken))
 
 
 class _Worker:
@@ -234,14 +240,15 @@ class _PortableError:
     trace: str
 
     @staticmethod
-    def from_exception(error: BaseException) -> _PortableError:
+    def from_exception(error: BaseException, broken: TaskError | None = None) -> _PortableError:
         """Return an exception in a form that can be pickled.
 
-        An exception in the task's code becomes a TaskError that names the line of code.
+        An exception in the task's code becomes a TaskError that names the line of code. `broken` replaces an exception
+        that would be reported as a bug of rlcli: a task has broken built-in functions.
         """
         trace = "".join(traceback.format_exception(error))
         if not isinstance(error, RlcliError):
-            error = memory_error(error) or error_of_task(error) or error
+            error = memory_error(error) or error_of_task(error) or broken or error
         if isinstance(error, RlcliError):
             return _PortableError(type(error), error.args, dict(error.__dict__), trace)
         if type(error).__module__ == "builtins":
