@@ -87,12 +87,7 @@ class TaskCheck:
     places: dict[Path, str] = field(default_factory=dict)  # `PythonTask.places`
 
     def document(self, changes: Iterable[Change] = ()) -> Document:
-        """Return the content of the task's file.
-
-        Args:
-            changes: changes from the command line. A configuration in Python receives the models of --model and
-                values for its required settings from them.
-        """
+        """Return the content of the task's file; Python configurations get models and needed values from `changes`."""
         file = self.source.config  # YAML: a task, or the record of a run
         recorded = upgraded(read(file, self.source.label), file) if file.suffix != ".py" else None
         if recorded is not None and self.source.python is None and self.source.value is None:
@@ -225,12 +220,7 @@ class TaskCheck:
             self.add(Problem(where, "agent", "the task has several agents and no default", hint))
 
     def patch(self, layer: str, at: Path) -> None:
-        """Merge a mapping of the configuration over the task itself: `play`, or `task` of the chosen agent.
-
-        Args:
-            layer: kind of source in the origins of the values: play or agent.
-            at: path of the mapping.
-        """
+        """Merge the mapping at path `at` (`play`, or `task` of an agent) over the task; origins name `layer`."""
         patch = self.layers.get(at)
         if patch is None or not self._is_mapping(patch, at):
             return
@@ -241,12 +231,7 @@ class TaskCheck:
         self.layers.merge(task, lambda path: Origin(layer, self.layers.place(at + path)))
 
     def apply(self, changes: Iterable[Change], name: str | None) -> None:
-        """Set the values of overrides and flags of the command line.
-
-        Args:
-            changes: path, value and origin of each.
-            name: the chosen agent, which `agent.KEY=VALUE` changes; None: such a change is a problem.
-        """
+        """Set the values of overrides and flags. `agent.KEY=VALUE` changes agent `name`; None: it is a problem."""
         for path, value, origin in changes:
             if path[0] == "agent":
                 if name is None:
@@ -437,11 +422,7 @@ class TaskCheck:
             self.problem(("observations",), "the observations need a group 'policy' with at least one term: add one")
 
     def _require_direct(self, data: Mapping[str, Any]) -> None:
-        """Check that a direct task has no terms except those of `success`.
-
-        For a task in another framework's format, the format's plugin also checks the settings that only its
-        environment class reads.
-        """
+        """Check that a direct task has only `success` terms, and let its format check the keys that its class reads."""
         if self.format is not None:
             key = self.format.spec.key
             for path, message, hint in self.format.call("check", data.get(key, {})) or ():

@@ -92,9 +92,7 @@ class ClosedLoopResult:
     by_task: list[str]
     """Terms without a formula, and forces, which the task's own code computed from the states of plain MuJoCo."""
     synchronized_return: float | None = None
-    """Mean return of episodes in which plain MuJoCo gets the environment's state after every step.
-
-    None: `plain_return` agrees with the evaluation, so these episodes were not needed."""
+    """Mean return with the environment's state set after every step; None: not needed, `plain_return` agrees."""
     disagreeing_steps: int = 0
     """Re-synchronised steps after which the states of the two sides differed by more than rounding."""
 

@@ -175,10 +175,7 @@ class EntityData:
 
     @property
     def root_lin_vel_w(self) -> Tensor:
-        """Linear velocity of the root's `velocity_point` (its origin or centre of mass), world frame.
-
-        (num_envs, 3) [m/s]
-        """
+        """Linear velocity of the root's origin or centre of mass: `velocity_point`, world frame. (num_envs, 3) [m/s]"""
         return self.root_com_lin_vel_w if self._at_com else self.root_origin_lin_vel_w
 
     @property
@@ -296,10 +293,7 @@ class EntityData:
 
     @property
     def body_lin_vel_w(self) -> Tensor:
-        """Velocities of each body's `velocity_point` (its origin or centre of mass), world frame.
-
-        (num_envs, bodies, 3) [m/s]
-        """
+        """Velocities of the bodies' origins or centres of mass (`velocity_point`). (num_envs, bodies, 3) [m/s]"""
         return self._once("body_lin_vel_w", lambda: self.body_lin_vel_of(ALL))
 
     def body_lin_vel_of(self, bodies: Columns, point: str | None = None) -> Tensor:
@@ -419,13 +413,7 @@ class EntityData:
         return found[1:]
 
     def _velocity_at(self, points: Tensor, bodies: Columns, roots: Columns) -> Tensor:
-        """Return the velocity of a point of each body, world frame. (num_envs, bodies, 3) [m/s]
-
-        Args:
-            points: positions of the points, world frame. (num_envs, bodies, 3) [m]
-            bodies: model ids of the bodies.
-            roots: model ids of the root bodies of their kinematic trees.
-        """
+        """Return the velocities of points (world frame) of bodies in trees with these roots. (num_envs, bodies, 3)"""
         # MuJoCo's cvel is the velocity at the centre of mass of the body's kinematic tree
         velocity = self._sim.derived_columns("cvel", bodies)
         return velocity[..., 3:] + cross(velocity[..., :3], self._from_tree_com(points, roots))
