@@ -132,7 +132,7 @@ class Note:
     """Dotted key in the source."""
     status: Status
     text: str = ""
-    """What it was translated to, or what is lost."""
+    """What the key was translated to, or which effect of the key is lost."""
 
     def __str__(self) -> str:
         """Return the note on one line."""

@@ -127,7 +127,7 @@ def _require_same_task(name: str, first: PolicyInTask, other_name: str, other: P
     """Check that two policies act in the same task.
 
     Raises:
-        UsageError: if the names of the tasks differ.
+        UsageError: if the tasks have different names, or come from different packages.
         ConfigError: with every setting that differs.
     """
     ours, theirs = first.resolved.source, other.resolved.source

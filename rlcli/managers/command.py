@@ -95,7 +95,7 @@ class CommandManager(TensorState):
         self._held_knobs: dict[str, Knob] = {}
 
     def knobs(self) -> list[Knob]:
-        """Return a `Knob` for each column of the commands that a person may set."""
+        """Return a `Knob`, with name and range, for each column of the commands that a user can set in the viewer."""
         found = []
         for term in self.terms:
             width = term.instance.command.shape[1]

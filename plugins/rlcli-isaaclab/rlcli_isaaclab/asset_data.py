@@ -178,7 +178,7 @@ class Data:
 
     @property
     def body_acc_w(self) -> Tensor:
-        """Linear accelerations of the centres of mass and angular ones, world frame. (num_envs, bodies, 6)"""
+        """Linear accelerations of the centres of mass, and angular accelerations, world frame. (num_envs, bodies, 6)"""
         return torch.cat([self._data.body_lin_acc_w, self._data.body_ang_acc_w], dim=-1)
 
     body_com_acc_w = body_acc_w

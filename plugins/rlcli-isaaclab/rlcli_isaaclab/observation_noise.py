@@ -19,7 +19,7 @@ class NoNoise:
         return data
 
     def reset(self, env_ids: Any) -> None:
-        """Do nothing."""
+        """Do nothing: this noise model has no state."""
 
 
 class NoiseModel(NoNoise):

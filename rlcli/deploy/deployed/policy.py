@@ -60,7 +60,10 @@ class Episode:
             self.memory[part["input"]] = np.zeros(part["single"], np.float32)
 
     def step(self, now):
-        """Return action and command for the observation of this step, which has each term once, without history."""
+        """Return the action, and the commands for the actuators, for the observation of this step.
+
+        `now` has the present value of each term; this object adds the values of earlier steps to terms with a history.
+        """
         start, values, now = 0, [], np.asarray(now, np.float32)
         _require_columns("now", now, [(term["name"], term["size"] // term["history"]) for term in self.terms], 1)
         for term in self.terms:

@@ -24,7 +24,7 @@ class ArraySpec:
 
     @property
     def size(self) -> int:
-        """Size with padding [bytes]."""
+        """Size of the tensor in shared memory, with the padding that aligns the next tensor [bytes]."""
         used = math.prod(self.shape) * self.dtype.itemsize
         return -(-used // _ALIGNMENT) * _ALIGNMENT
 

@@ -19,7 +19,7 @@ caches are cold."""
 
 
 class ChannelClosedError(Exception):
-    """The other process has ended."""
+    """Error that the process at the other end of a connection has ended."""
 
 
 class Channel:
