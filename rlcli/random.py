@@ -23,7 +23,7 @@ _TO_UNIT = np.array(2.0**-24, np.float32)
 _NARROW = 8
 """Number of words of a key up to which numpy adds faster along the keys than along the words."""
 _BLOCK = 1 << 14
-"""Number of words that are mixed at once: their copies stay in the cache of a core."""
+"""Number of 64-bit values that are hashed at once, so that their copies stay in the cache of a core."""
 
 
 @functools.lru_cache(maxsize=4096)

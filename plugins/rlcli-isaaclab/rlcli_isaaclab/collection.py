@@ -41,7 +41,7 @@ class RigidObjectCollection:
         self.body_names = self.object_names
 
     def find_objects(self, name_keys: Any, preserve_order: bool = False) -> Any:
-        """Return ids and names of the objects that names or regexes match."""
+        """Return (indices, names) of the objects whose names match `name_keys`, names or regexes."""
         return find_elements(name_keys, self.object_names, self.object_names, "object", preserve_order)
 
     def write_object_state_to_sim(self, object_state: Tensor, env_ids: Any = None, object_ids: Any = None) -> None:

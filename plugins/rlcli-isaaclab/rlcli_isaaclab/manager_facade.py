@@ -178,7 +178,7 @@ class RewardSettings:
 
     @property
     def weight(self) -> float:
-        """Current weight."""
+        """Weight of the reward term, which a curriculum may change."""
         weight = self._tunable.get(self._path)
         return self._config.weight if weight is None else float(weight)
 

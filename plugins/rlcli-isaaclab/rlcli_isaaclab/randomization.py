@@ -157,7 +157,7 @@ def _gravity(event: EventParameters) -> EventConfigs:
     ends = event.require("gravity_distribution_params")
     is_pair = isinstance(ends, list | tuple) and len(ends) == 2
     if not is_pair or any(not isinstance(end, list | tuple) or len(end) != 3 for end in ends):
-        raise ParameterError(f"gravity_distribution_params: expected ([x, y, z], [x, y, z]), found {ends}")
+        raise ParameterError(f"gravity_distribution_params: expected (lowest, highest), each [x, y, z]; found {ends}")
     pairs = [_pair("gravity_distribution_params", pair) for pair in zip(*ends, strict=True)]
     event.approximate("gravity_distribution_params", "every environment has its own gravity")
     return {"": {"func": "randomize_gravity", "axes": [0, 1, 2], "range": pairs, **event.sampling("add")}}

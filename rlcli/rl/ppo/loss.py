@@ -27,7 +27,7 @@ class LossResult(NamedTuple):
     """Loss of a minibatch, its metrics and the new policy's distribution."""
 
     loss: Tensor
-    """Scalar that the optimiser minimises. (scalar)"""
+    """Loss that the optimiser minimises. (scalar)"""
     metrics: Tensor
     """`METRICS`, detached. (7,)"""
     mean: Tensor

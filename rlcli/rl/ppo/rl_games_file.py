@@ -162,7 +162,7 @@ class RlGamesReader:
             elif key == "d2rl" and value:
                 self.problem((*at, key), "d2rl networks are not supported; remove this key")
             elif key == "initializer":
-                self.note((*at, key), "mapped", "init")
+                self.note((*at, key), "mapped", "the key `init` of ppo")
             elif key == "d2rl":
                 self.note((*at, key), "ignored", "d2rl is off, and rlcli has no d2rl networks")
             elif key == "regularizer":
