@@ -46,7 +46,7 @@ class TimeToThreshold:
     """Time, environment steps and iteration at which a training reached its threshold."""
 
     seconds: float
-    """Sum of all rollouts and updates until then, without evaluations [s]."""
+    """Time of all rollouts and updates until the threshold was reached, without evaluations [s]."""
     step: int
     """Environment steps."""
     iteration: int

@@ -67,7 +67,7 @@ class BodyWrench:
         self._local: Tensor | None = None
         self._is_global = False
         self.is_applied = False
-        """Whether something calls `apply` before each physics step."""
+        """Whether `apply` is called before each physics step: by the task's code, or after `start`."""
 
     @property
     def local(self) -> Tensor:

@@ -181,7 +181,7 @@ class PpoSettings(_Settings):
     """Settings of PPO: the mapping `params.config`."""
 
     normalize_input: bool
-    """Normalize observations by running mean and standard deviation."""
+    """Whether observations are normalized by running mean and standard deviation."""
     normalize_value: bool = False
     """Whether the critic is trained on returns that are normalized by running mean and standard deviation."""
     normalize_advantage: bool
@@ -249,7 +249,7 @@ class SacSettings(_Settings):
     """Settings of SAC: the mapping `params.config`."""
 
     normalize_input: bool = False
-    """Normalize observations by running mean and standard deviation."""
+    """Whether observations are normalized by running mean and standard deviation."""
     value_bootstrap: bool = True
     """Whether a time-out is bootstrapped; `bootstrap` sets how."""
     reward_shaper: RewardShaper = RewardShaper()
