@@ -63,7 +63,7 @@ class Robot:
         """Factor of all durations of the task, such as the episode length; below 1 if the decimation would exceed
         `_MAX_DECIMATION`."""
         self.gravity = float(np.linalg.norm(model.opt.gravity))
-        """Gravity of the file, in the units of the file [m/s^2]."""
+        """Magnitude of gravity in the MJCF, in the unit of length of the file per s^2."""
         balls = [model.joint(j).name for j in range(model.njnt) if model.jnt_type[j] == int(mujoco.mjtJoint.mjJNT_BALL)]
         if balls:
             raise ValueError(f"ball joints are not supported: {listing(balls)}; use three hinges")
@@ -204,7 +204,8 @@ class Robot:
             if joint in stiff:
                 kp, kv = stiff[joint]
             else:
-                kp = effort * (10.0 if self.model.jnt_type[joint] == SCALAR[1] else 1.0)  # all of it at 0.1 m or 1 rad
+                # the whole effort at an error of 0.1 m or 1 rad
+                kp = effort * (10.0 if self.model.jnt_type[joint] == SCALAR[1] else 1.0)
                 kv = 2.0 * 0.5 * math.sqrt(kp * self.inertia[joint])  # damping ratio 0.5
             settings[self.name(joint)] = {"kp": round3(kp), "kv": round3(kv), "effort_limit": round3(effort)}
         return settings

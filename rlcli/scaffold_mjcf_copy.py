@@ -22,7 +22,8 @@ def default_pose(spec: mujoco.MjSpec) -> np.ndarray | None:
     `numeric` with the name `init_qpos`.
     """
     keys = sorted(spec.keys, key=lambda key: key.name not in ("home", "stand", "standing"))
-    start = next((numeric for numeric in spec.numerics if numeric.name == "init_qpos"), None)  # a habit of Gymnasium
+    # Gymnasium's MJCFs store the start pose here
+    start = next((numeric for numeric in spec.numerics if numeric.name == "init_qpos"), None)
     if keys:
         return np.array(keys[0].qpos)
     return None if start is None else np.array(start.data)

@@ -320,7 +320,7 @@ class _PlainMujocoRunner:
                 data.ctrl[:] = np.where(self._closed, self._ctrl[i], ctrl[i])
                 for name, values in forces.items():
                     applied = getattr(data, name)
-                    if not np.array_equal(applied, values[i]):  # no event has set it, but the code of the step
+                    if not np.array_equal(applied, values[i]):  # the force was set by the step, not by an event
                         self._forces.add(name)
                         applied[...] = values[i]
                 mujoco.mj_step(self._models[i], data, self._decimation // calls)

@@ -133,7 +133,7 @@ class VecEnv(Workflow):
         self._reset_envs(self._select_all())
         return self._observe()
 
-    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # a simulation that diverges; the guard finds it
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # a diverging simulation: the guard reports it
     def step(self, action: Tensor, restart: Tensor | None = None) -> StepResult:
         """Apply one action for `decimation` physics steps; for arguments and errors see `Environment.step`.
 

@@ -88,7 +88,8 @@ class Evaluation:
 
         Episode i of two evaluations with the same seed then has the same random numbers in both.
         """
-        return self._rows(sorted(range(len(self.envs)), key=lambda row: self.envs[row]), 0)  # a stable sort
+        # stable: keeps an environment's order
+        return self._rows(sorted(range(len(self.envs)), key=lambda row: self.envs[row]), 0)
 
     def _rows(self, rows: list[int], first: int) -> Self:
         def take(column: Any) -> Any:

@@ -92,7 +92,7 @@ def _search(pattern: str, names: Sequence[str], what: str) -> list[int]:
     _require_cheap(pattern, max(map(len, names), default=0))
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("error")  # a set in which another one seems to begin
+            warnings.simplefilter("error")  # warns of `[` within a set, which may become a nested set
             regex = re.compile(pattern)
     except (re.error, OverflowError, RecursionError, FutureWarning) as error:
         message = f"'{pattern}' is neither the name of a {what} nor a regular expression ({error}); correct it"

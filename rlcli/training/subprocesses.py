@@ -153,6 +153,6 @@ def train_all(
             poll()
             time.sleep(POLL_S)
     finally:
-        for process in active:  # after an error some may still run
+        for process in active:  # after an error some subprocesses may still run
             process.process.kill()
     return ended

@@ -35,7 +35,7 @@ class Threshold:
         """Return a number of evaluation episodes, at least `least`, for which `is_certain` can be true."""
         if self.key != "success":
             return max(least, 2)
-        from rlcli.rl.confidence import NORMAL  # it imports numpy
+        from rlcli.rl.confidence import NORMAL  # imports numpy
 
         # Wilson's lower end with n of n successes is n / (n + z^2); twice as many episodes leave room for failures
         return max(least, 2 * math.ceil(NORMAL * NORMAL * self.value / (1.0 - self.value)))

@@ -103,7 +103,7 @@ class _AbsentMeta(type):
         return AbsentValue(f"{type.__getattribute__(cls, '__doc__')}.{name}")
 
     def __call__(cls, *args: Any, **settings: Any) -> Any:
-        if "absent_name" not in vars(cls):  # a subclass of the user
+        if "absent_name" not in vars(cls):  # a class of the user, derived from a replaced class
             raise absence(str(getattr(cls, "absent_name", cls.__name__)))
         return AbsentValue(str(cls.__doc__))
 

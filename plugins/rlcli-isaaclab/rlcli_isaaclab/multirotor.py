@@ -68,7 +68,7 @@ class Thruster:
         first = rate(error)
         if self.cfg.integration_scheme == "euler":
             return first * dt
-        # Isaac Lab's scheme: its stages add to the error
+        # Runge-Kutta as in Isaac Lab, which adds the stages to the error
         second = rate(error + 0.5 * dt * first)
         third = rate(error + 0.5 * dt * second)
         fourth = rate(error + dt * third)

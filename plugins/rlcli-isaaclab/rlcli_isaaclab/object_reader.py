@@ -87,7 +87,7 @@ class ObjectReader:
             elif value is None:
                 continue
             elif key in known and not known[key].required and equals_default(value, known[key].default):
-                continue  # the term's default
+                continue  # rlcli's term has this default
             elif key in known:
                 config[key] = self._read_action_value(key, value, config.get("joints"))
             elif has_no_effect(key, value):

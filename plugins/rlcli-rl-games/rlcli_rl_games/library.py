@@ -13,7 +13,7 @@ from rlcli.rl.trainer_base import require_library
 require_library("rl-games", "rl-games>=1.6,<1.7", at_least=(1, 6), below=(1, 7))
 
 with warnings.catch_warnings():
-    warnings.simplefilter("ignore")  # from modules that rl_games imports
+    warnings.simplefilter("ignore")  # modules that rl_games imports give warnings
     from rl_games.algos_torch.a2c_continuous import A2CAgent
     from rl_games.algos_torch.sac_agent import SACAgent
     from rl_games.common.algo_observer import AlgoObserver

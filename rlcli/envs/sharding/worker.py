@@ -76,7 +76,7 @@ def main(connection: int, arrays: int) -> None:
                 _serve(channel, arrays)
         except ChannelClosedError:
             raise
-        except BaseException as error:  # of an import, or of a message that cannot be read
+        except BaseException as error:  # an import failed, or a message is unreadable
             channel.send(ERROR, _PortableError.from_exception(error))
             channel.wait_until_closed()
     os._exit(0)  # without waiting for the engine's threads
