@@ -97,5 +97,5 @@ class Layout:
 
 
 def _finite_pairs(pairs: tuple[tuple[float, float], ...] | None) -> list[list[float | None]] | None:
-    """Return the pairs with None for each infinite value, because JSON has no infinity; None if there are no pairs."""
+    """Return (low, high) pairs as lists, with None for infinity, which JSON does not have; None if there are none."""
     return [[x if math.isfinite(x) else None for x in pair] for pair in pairs or ()] or None

@@ -85,9 +85,9 @@ class PartMemory:
         return self._views[part][self._ends[network] : self._ends[network + 1]]
 
     def sum_parts(self, rows: int, out: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-        """Add up the parts of a minibatch: write its gradients to `out`; return its statistics (`OutputGradient`).
+        """Add up the results of all parts of a minibatch, and write its gradients to `out`.
 
-        The actor's statistics have the shape (columns,), the critic's ().
+        Return the statistics that `OutputGradient` computes: those of the actor, (columns,), and of the critic, ().
         """
         parts = len(self.split(rows))
         torch.sum(self._gradients[:parts], dim=0, out=self._sum)

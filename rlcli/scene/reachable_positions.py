@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 _COUNT = 2048
-"""Number of random poses."""
+"""Number of random poses that `reachable_positions` samples."""
 _SHARES = np.linspace(0.125, 1.0, 8)
-"""Points of the way to a pose at which contacts are computed, as shares of the way."""
+"""Points of the straight way from the default pose to a pose at which contacts are computed (0: start, 1: end)."""
 
 
 def reachable_positions(
@@ -21,11 +21,11 @@ def reachable_positions(
     body: int,
     offsets: tuple[float, float],
 ) -> NDArray[np.float64]:
-    """Return positions of a body in random poses, world frame. (n, 3) [m]
+    """Return positions of a body in random poses of its robot, world frame. (n, 3) [m]
 
-    The joints can move to each pose on a straight line from the default pose: poses with a contact on the way that the
-    default pose does not have, for example between two links or with the ground, are left out. If no other pose is
-    left, they count.
+    Poses are left out if a contact that the default pose does not have, for example between two links or with the
+    ground, occurs when the joints move to the pose on a straight line from the default pose. If that leaves out all
+    poses, none is left out.
 
     Args:
         model: the compiled scene.
@@ -57,9 +57,9 @@ def random_poses(
     offsets: tuple[float, float],
     count: int,
 ) -> NDArray[np.float64]:
-    """Return uniformly drawn poses, the same ones in each call, as qpos. (count, nq)
+    """Return uniformly sampled poses, the same ones in each call, as rows of qpos. (count, nq)
 
-    For the arguments see `reachable_positions`.
+    The arguments are those of `reachable_positions`.
     """
     generator, addresses = np.random.default_rng(0), model.jnt_qposadr[list(joints)]
     limited = model.jnt_limited[list(joints)].astype(bool)
@@ -76,7 +76,7 @@ def random_poses(
 
 
 def follow_coupled_joints(model: mujoco.MjModel, poses: NDArray[np.float64], joints: Sequence[int]) -> None:
-    """Set the joints that equalities couple to one of `joints` in poses. (n, nq)"""
+    """Set in `poses`, (n, nq), the positions of joints that an equality of the MJCF couples to one of `joints`."""
     for follower, leader, coefficients in coupled_joints(model):
         own, other = model.jnt_qposadr[follower], model.jnt_qposadr[leader]
         if leader in joints:
@@ -85,13 +85,16 @@ def follow_coupled_joints(model: mujoco.MjModel, poses: NDArray[np.float64], joi
 
 
 def coupled_joints(model: mujoco.MjModel) -> list[tuple[int, int, NDArray[np.float64]]]:
-    """Return follower, leader and polynomial coefficients of each active equality between two joints."""
+    """Return (follower, leader, polynomial coefficients) of each active equality between two joints.
+
+    The follower is the joint whose position is the polynomial of the leader's position. Both are ids of joints.
+    """
     between = (model.eq_type == int(mujoco.mjtEq.mjEQ_JOINT)) & (model.eq_obj2id >= 0) & (model.eq_active0 != 0)
     return [(int(model.eq_obj1id[e]), int(model.eq_obj2id[e]), model.eq_data[e, :5]) for e in np.flatnonzero(between)]
 
 
 def _contacts(model: mujoco.MjModel, data: mujoco.MjData, qpos: NDArray[np.float64]) -> set[tuple[int, int]]:
-    """Return the pairs of geoms that touch at `qpos`."""
+    """Return the pairs of geoms, as ids, that penetrate each other at `qpos`."""
     data.qpos[:] = qpos
     mujoco.mj_kinematics(model, data)
     mujoco.mj_collision(model, data)

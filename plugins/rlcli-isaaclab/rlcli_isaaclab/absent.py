@@ -1,4 +1,4 @@
-"""Stand-ins for names of Isaac Lab and Isaac Sim that rlcli does not have. They raise an error when they are used."""
+"""Replacements for names of Isaac Lab and Isaac Sim that rlcli does not have. They raise an error when they are used."""
 
 from __future__ import annotations
 
@@ -92,9 +92,9 @@ def place_of(error: BaseException) -> str:
 
 
 class _AbsentMeta(type):
-    """Metaclass of the stand-ins for classes of Isaac Lab that rlcli does not have.
+    """Metaclass of the objects that replace classes of Isaac Lab that rlcli does not have.
 
-    The attributes of a stand-in are `AbsentValue`s. A task may subclass it, but not create objects of the subclass.
+    The attributes of a replacement are `AbsentValue`s. A task may subclass it, but not create objects of the subclass.
     """
 
     def __getattr__(cls, name: str) -> Any:
@@ -109,7 +109,7 @@ class _AbsentMeta(type):
 
 
 class AbsentValue:
-    """Stand-in for a constant or function of Isaac Lab that rlcli does not have.
+    """Replacement for a constant or function of Isaac Lab that rlcli does not have.
 
     Code may copy it, store it, pass it to functions and read its attributes; calling it raises a TaskError.
     """
@@ -155,7 +155,7 @@ class AbsentValue:
 
 
 class AbsentModule(ModuleType):
-    """Stand-in for a module of Isaac Sim. Any name can be imported from it; using the name raises an error."""
+    """Replacement for a module of Isaac Sim. Any name can be imported from it; using the name raises an error."""
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
@@ -192,7 +192,7 @@ def absent_module(name: str) -> AbsentModule:
 
 
 def absent_class(name: str) -> type:
-    """Return the stand-in of a class. It can be subclassed; calling it returns an `AbsentValue`."""
+    """Return a replacement for a class that rlcli lacks: it can be subclassed, and a call returns an `AbsentValue`."""
     return _AbsentMeta(name.rpartition(".")[2], (), {"__doc__": name, "absent_name": name, "__module__": __name__})
 
 
@@ -207,7 +207,7 @@ def absent_function(name: str) -> AbsentValue:
 
 
 class _NoSettings:
-    """Stand-in for the settings of Isaac Sim's application; all are unset."""
+    """Replacement for the settings of Isaac Sim's application; all are unset."""
 
     def get(self, name: str) -> None:
         """Return None."""
@@ -220,7 +220,7 @@ class _NoSettings:
 
 
 class NoEffect:
-    """Stand-in for a USD prim that only changes the appearance of a scene, or for a part of one: calls do nothing."""
+    """Replacement for a USD prim that only changes the appearance of a scene, or for a part of one: calls do nothing."""
 
     def __init__(self, name: str) -> None:
         self._name = name

@@ -318,7 +318,7 @@ class _Recorded(BaseException):
 
 
 class _Shell:
-    """Stand-in for the environment of rlcli, with the values that `_setup_scene` may read before it exists."""
+    """Replacement for the environment of rlcli, with the values that `_setup_scene` may read before it exists."""
 
     def __init__(self, cfg: Any) -> None:
         self.device, self.num_envs = "cpu", cfg.scene.num_envs

@@ -50,7 +50,10 @@ class HookTerm:
 
 
 class DirectRunner:
-    """Caller of the hooks of the user's `DirectRLEnv`, in the right order, for an environment of rlcli."""
+    """Caller of the methods of the user's `DirectRLEnv`, such as `_get_rewards`, in the order of Isaac Lab's loop.
+
+    The methods that a task implements are called hooks.
+    """
 
     def __init__(self, managed: Any, term: HookTerm) -> None:
         self.managed = managed

@@ -149,7 +149,10 @@ class ManagerTermBase:
 
 
 class ActionTerm(ManagerTermBase):
-    """Base of the user's own actions: `process_actions` runs once per step, `apply_actions` in each physics step."""
+    """Base class of the user's own actions.
+
+    `process_actions` is called once per environment step, `apply_actions` before each physics step.
+    """
 
     def __init__(self, cfg: Any, env: Any) -> None:
         super().__init__(cfg, env)
@@ -184,7 +187,7 @@ class ActionTerm(ManagerTermBase):
 
 
 class CommandTerm(ManagerTermBase):
-    """Base of the user's own commands. The environment decides when to resample them."""
+    """Base class of the user's own commands. The environment decides when new commands are sampled."""
 
     def __init__(self, cfg: Any, env: Any) -> None:
         super().__init__(cfg, env)

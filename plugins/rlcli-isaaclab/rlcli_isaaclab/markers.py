@@ -1,4 +1,4 @@
-"""Stand-in for markers that a task creates, which rlcli does not draw. Names as in `isaaclab.markers`."""
+"""Replacement for markers that a task creates, which rlcli does not draw. Names as in `isaaclab.markers`."""
 
 from __future__ import annotations
 

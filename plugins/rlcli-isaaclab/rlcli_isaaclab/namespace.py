@@ -1,7 +1,7 @@
 """Replacement of the modules `isaaclab` and `isaacsim` that task files import.
 
 The table `names.json` lists the public names of each module of Isaac Lab; `tools/names.py` writes it. A name that this
-package defines is imported from this package. For any other name of the table a task gets a stand-in, which raises an
+package defines is imported from this package. For any other name of the table a task gets a replacement, which raises an
 error when the task uses it.
 """
 
@@ -141,7 +141,10 @@ def module_of(name: str, file: str) -> ModuleType | None:
 
 
 def _trainer_module(name: str, file: str) -> ModuleType | None:
-    """Return a module of a library of agents: the repository's own one (None), the installed one, or a stand-in."""
+    """Return a module of a library of agents: the installed one, or else a replacement.
+
+    Return None if the repository of the task has such a module itself.
+    """
     top, _, inner = name.partition(".")
     if top not in sys.modules:
         import_package(top, inner, Path(file))
@@ -157,7 +160,7 @@ def _trainer_module(name: str, file: str) -> ModuleType | None:
 
 @functools.cache
 def _extended_module(name: str) -> ModuleType:
-    """Return an installed module that also has the names of other versions of its library, as stand-ins."""
+    """Return an installed module to which replacements for names of other versions of its library are added."""
     installed = importlib.import_module(name)
     module = absent_module(name)
     vars(module).update({key: value for key, value in vars(installed).items() if key != "__getattr__"})
