@@ -1,4 +1,4 @@
-"""Replacements for names of Isaac Lab and Isaac Sim that rlcli does not have. They raise an error when they are used."""
+"""Replacements for names of Isaac Lab and Isaac Sim that rlcli does not have. Using them raises an error."""
 
 from __future__ import annotations
 
@@ -220,7 +220,7 @@ class _NoSettings:
 
 
 class NoEffect:
-    """Replacement for a USD prim that only changes the appearance of a scene, or for a part of one: calls do nothing."""
+    """Replacement for a USD prim that only changes how a scene looks, or for a part of a prim: calls do nothing."""
 
     def __init__(self, name: str) -> None:
         self._name = name

@@ -1,4 +1,4 @@
-"""Configuration of differential inverse kinematics, and a replacement for Pink's. Names as in `isaaclab.controllers`."""
+"""Configuration of differential inverse kinematics; a replacement for Pink's. Names as in `isaaclab.controllers`."""
 
 from __future__ import annotations
 

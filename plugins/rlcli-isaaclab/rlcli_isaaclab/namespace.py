@@ -1,8 +1,8 @@
 """Replacement of the modules `isaaclab` and `isaacsim` that task files import.
 
 The table `names.json` lists the public names of each module of Isaac Lab; `tools/names.py` writes it. A name that this
-package defines is imported from this package. For any other name of the table a task gets a replacement, which raises an
-error when the task uses it.
+package defines is imported from this package. For any other name of the table a task gets a replacement, which raises
+an error when the task uses it.
 """
 
 from __future__ import annotations
