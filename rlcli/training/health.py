@@ -334,7 +334,7 @@ def actions_at_bound(health: Health) -> Found:
 
 
 def blocked_success(health: Health) -> Found:
-    """Report a success condition that blocks success: it holds much less often than the others, or never."""
+    """Report a success condition that blocks success: it holds much less often than the others, or no longer."""
     for name, condition in health.task.success.items():
         held, values = health.median(f"Success/{name}"), health.values(f"Success_Value/{name}")
         if held is None or condition is None or not health.struggles(0.15):
@@ -342,13 +342,15 @@ def blocked_success(health: Health) -> Found:
         others = [health.median(n) or 0.0 for n in health.names("Success/") if n != f"Success/{name}"]
         alone = bool(others) and min(others) > 0.5 and held < 0.1 * min(others) and health.progress == 1.0
         learned = health.change(RETURN) > 1.0 and not _approaches(health.values(RETURN))
-        never = max(health.values(f"Success/{name}")) == 0.0 and (learned or health.progress == 1.0)
+        shares = health.values(f"Success/{name}")
+        # a random policy may have met the condition at the beginning
+        never = not any(shares[len(shares) // 2 :]) and (learned or health.progress == 1.0)
         gaps, states = _gaps(values, condition.model_dump()), health.values(f"Health/held/{name}")
         # the mean is near the bound, but no environment is within it in any of the states at the checks
         halved = _halved(gaps)
         # an error that must be exactly 0
         exact = bool(values) and condition.at_most is not None and condition.at_most <= 0.0 < min(values)
-        unmet = not any(health.values(f"Success/{name}")) and len(states) > 2 and not any(states)
+        unmet = not any(shares) and len(states) > 2 and not any(states)
         if (never and not _approaches(gaps)) or alone or (unmet and (halved or exact)):
             value = f"; its value is {statistics.fmean(values[-3:]):.3g}" if values else ""
             bound = f"; it must be {text}" if (text := bound_text(condition.model_dump())) else ""

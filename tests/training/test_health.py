@@ -146,6 +146,14 @@ def test_condition_that_blocks_success_is_named_with_its_value():
     assert "at most 0.1" in found["blocked-success"].message
 
 
+@pytest.mark.parametrize(("held_in", "named"), [(2, True), (35, False)])
+def test_condition_that_a_random_policy_met_once_is_named(held_in, named):
+    """Only the newer half of the 40 iterations counts."""
+    plateau = {"Train/mean_reward": lambda i: 5.0 - 7.0 * 0.8**i, "Success_Value/pole": lambda i: 0.3}
+    once = {"Success/pole": lambda i: 0.01 * (i == held_in)}
+    assert ("blocked-success" in findings({**FAILING, **plateau, **once}, until=0.5)) is named
+
+
 def test_every_check_is_on_the_page():
     page = (Path(__file__).parents[2] / "docs/guides/training-does-not-learn.md").read_text()
     assert [name for name in CHECKS if f"| `{name}` |" not in page] == []
