@@ -216,11 +216,12 @@ def one_termination(health: Health) -> Found:
     Their lengths are compared with those at the start, or with those in the middle of the training.
     """
     late = {name for name, term in health.task.terminations.items() if term is not None and term.time_out}
+    complete = [v for n in late | {"time_out"} for v in _newer_half(health.values(f"Episode_Termination/{n}"))]
     for metric in health.names("Episode_Termination/"):
         name, share = metric.partition("/")[2], health.median(metric)
         if name in late | {"time_out"} or share is None or share < 0.99 or not health.struggles(0.15):
             continue
-        early = health.change(LENGTH) < 1.0
+        early = health.change(LENGTH) < 1.0 and max(complete, default=0.0) < 0.05
         if (early or _stalled(health)) and not _approaches(health.values(RETURN)):
             length = statistics.fmean(health.last(LENGTH))
             since = "at first" if early else "in the middle of the training so far, and none succeeds"
@@ -344,7 +345,7 @@ def blocked_success(health: Health) -> Found:
         learned = health.change(RETURN) > 1.0 and not _approaches(health.values(RETURN))
         shares = health.values(f"Success/{name}")
         # a random policy may have met the condition at the beginning
-        never = not any(shares[len(shares) // 2 :]) and (learned or health.progress == 1.0)
+        never = not any(_newer_half(shares)) and (learned or health.progress == 1.0)
         gaps, states = _gaps(values, condition.model_dump()), health.values(f"Health/held/{name}")
         # the mean is near the bound, but no environment is within it in any of the states at the checks
         halved = _halved(gaps)
@@ -385,10 +386,28 @@ def reward_against_success(health: Health) -> Found:
     yield message, "other signs or weights of the rewards, or a reward for success"
 
 
+def falling_success(health: Health) -> Found:
+    """Report a success rate that has fallen below half of its best value, both averaged over some iterations."""
+    values, size = health.values(SUCCESS), len(health.last(SUCCESS))
+    if len(values) < _MIN_VALUES:
+        return
+    means = [statistics.fmean(values[end - size : end]) for end in range(size, len(values) + 1)]
+    if max(means) >= _SOLVED and means[-1] < 0.5 * max(means):
+        best, now = max(means), means[-1]
+        hint = "a smaller agent.learning_rate or desired_kl, a larger entropy_coef"
+        if any(health.task.curriculum.values()):
+            hint += ", a slower curriculum"
+        yield f"the success rate has fallen from {best:.1%} to {now:.1%}", f"{hint}, or a checkpoint before the fall"
+
+
 def _gaps(values: list[float], bounds: Mapping[str, Any]) -> list[float]:
     """Return minus the distance of each value to the range `at_least` to `at_most`; 0 within the range."""
     low, high = bounds.get("at_least"), bounds.get("at_most")
     return [-max((low if low is not None else v) - v, v - (high if high is not None else v), 0.0) for v in values]
+
+
+def _newer_half(values: list[float]) -> list[float]:
+    return values[len(values) // 2 :]
 
 
 def _halved(gaps: list[float]) -> bool:
@@ -409,7 +428,7 @@ def _approaches(values: list[float]) -> bool:
 _IN_ORDER: tuple[Callable[[Health], Found], ...] = (
     *(no_reward, short_episodes, observations, update_size, learning_rate_range, exploration, dying_pays),
     *(one_termination, value_function, actions_at_bound, blocked_success, reward_without_success),
-    *(reward_against_success, no_progress),
+    *(reward_against_success, falling_success, no_progress),
 )
 CHECKS = {check.__name__.replace("_", "-"): check for check in _IN_ORDER}
 """Name -> check function, in the order in which findings are listed."""
