@@ -6,9 +6,10 @@ import contextlib
 import logging
 import shlex
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rlcli.errors import DivergedError, MachineError, Stopped
 from rlcli.rl import distributed
@@ -19,7 +20,7 @@ from rlcli.runs.run import Run
 from rlcli.training.checkpoint_writer import CheckpointWriter
 from rlcli.training.health import Health, probe
 from rlcli.training.periodic_eval import PeriodicEval
-from rlcli.training.progress import Progress
+from rlcli.training.progress import Progress, progress_from_metrics
 from rlcli.training.signals import Interrupted, StopRequest
 
 if TYPE_CHECKING:
@@ -32,6 +33,8 @@ SAVE_EVERY_S = 60.0
 """Time between checkpoints without a `save_interval` [s]."""
 LONG_S = 0.1
 """Duration of an iteration above which the next can be interrupted: the state before it is copied [s]."""
+RECENT = 100
+"""Number of iterations whose mean duration gives the time left."""
 DIVERGED_SHARE = 0.01
 """Share of an iteration's environment steps that may diverge before the run stops."""
 
@@ -67,6 +70,8 @@ class TrainLoop:
     """Iteration and environment steps at the beginning of the current iteration."""
     _iteration_s: float = field(init=False, default=0.0)
     """Duration of the last iteration [s]."""
+    _recent: deque[dict[str, Any]] = field(init=False, default_factory=lambda: deque(maxlen=RECENT))
+    """Rows of the newest iterations, as in `metrics.jsonl`."""
     _saved_at: float = field(init=False, default_factory=time.monotonic)
 
     def train(self, budget: Budget) -> None:
@@ -102,15 +107,17 @@ class TrainLoop:
         if writer.newest is None:
             self._save()
             writer.wait()
-        begin, first_step = time.monotonic(), trainer.env_steps
+        begin = time.monotonic()
         # a signal on any rank stops all ranks at the same boundary
         while not (stopped := any(self._ranks.sum(self.stop.signal is not None))) and not self._is_over(budget):
             report, evaluation, is_best, must_save = self._iterate()
             self.metrics = metrics = {**_with_rates(report, trainer.steps_per_iteration), **evaluation}
+            now = time.monotonic()
+            metrics["Perf/iteration_time"], begin = now - begin, now
             for logger in self.loggers:
                 logger.write(trainer.iteration, trainer.env_steps, metrics)
             self._check_health(metrics)
-            self.show(self._progress(budget, report, metrics, time.monotonic() - begin, first_step))
+            self.show(self._progress(budget, metrics))
             if must_save or writer.is_due(trainer.iteration, self.save_interval):
                 self._save()
             if is_best:
@@ -205,16 +212,13 @@ class TrainLoop:
                 self.writer.newest = boundary
         self._saved_at = time.monotonic()
 
-    def _progress(
-        self, budget: Budget, report: Report, metrics: dict[str, float], elapsed_s: float, first_step: int
-    ) -> Progress:
-        """Return the progress after an iteration of a training that started at `first_step` environment steps."""
-        trainer, iterations = self.trainer, budget.iterations(self.trainer)
-        rate = (trainer.env_steps - first_step) / max(elapsed_s, 1e-9)
-        left = (iterations - trainer.iteration) * trainer.steps_per_iteration / max(rate, 1e-9)
-        done = trainer.iteration, iterations, trainer.env_steps
-        notes = [] if self.health is None else [*self.health.notes(metrics), *self.run.findings()]
-        return Progress(*done, elapsed_s, left, rate, report.seconds, metrics, notes)
+    def _progress(self, budget: Budget, metrics: dict[str, float]) -> Progress:
+        """Return the progress after an iteration with these metrics."""
+        trainer = self.trainer
+        self._recent.append({**metrics, "iteration": trainer.iteration, "step": trainer.env_steps})
+        progress = progress_from_metrics([*self._recent], budget.iterations(trainer))
+        progress.notes = [] if self.health is None else [*self.health.notes(metrics), *self.run.findings()]
+        return progress
 
     def _stopped(self, message: str) -> Stopped:
         """Return the error of a stopped run, with the command that resumes it."""
