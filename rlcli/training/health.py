@@ -107,7 +107,8 @@ class Health:
             if condition is not None and f"Success/{name}" in metrics:
                 value = metrics.get(f"Success_Value/{name}")
                 bound = "" if value is None else f", value {value:.3g}, {bound_text(condition.model_dump())}"
-                lines.append(f"success in training: {name} held in {metrics[f'Success/{name}']:.1%}{bound}{reached}")
+                held = f"{metrics[f'Success/{name}']:.1%}"
+                lines.append(f"success in this iteration's episodes: {name} held in {held}{bound}{reached}")
         return lines
 
     def names(self, prefix: str) -> list[str]:

@@ -74,7 +74,7 @@ def run_training(
         CrashDumper(env, run.folder / "dumps")
     first_step = trainer.env_steps
     try:
-        _train(job, trainer, env, stop, view)
+        metrics = _train(job, trainer, env, stop, view)
     finally:
         run.unlock()
         env.close()
@@ -83,11 +83,15 @@ def run_training(
         return None
     newest = run.checkpoints / f"{steps(run.checkpoints)[-1]:012d}"
     elapsed, seed, step = time.monotonic() - job.begin, run.record["seed"], trainer.env_steps
-    return TrainingResult(run.folder, newest, step, trainer.iteration, elapsed, seed, step - first_step)
+    return TrainingResult(run.folder, newest, step, trainer.iteration, elapsed, seed, step - first_step, metrics)
 
 
-def _train(job: Job, trainer: Trainer, env: Environment, stop: StopRequest, view: ProgressView) -> None:
-    """Open loggers and checkpoints, run the loop, and record in the run how it ended."""
+def _train(job: Job, trainer: Trainer, env: Environment, stop: StopRequest, view: ProgressView) -> dict[str, float]:
+    """Open loggers and checkpoints, run the loop, and record in the run how it ended.
+
+    Returns:
+        The metrics of the last iteration.
+    """
     run, (agent, _) = job.run, job.resolved.require_agent()
     budgets = [Budget(end, None) for end in job.stages] or [Budget(agent.max_iterations, agent.max_steps)]
     writer = _open_writer(job, env)
@@ -139,6 +143,7 @@ def _train(job: Job, trainer: Trainer, env: Environment, stop: StopRequest, view
         _log.info("%s", note)
     for finding in run.findings() if job.writes else ():
         _log.warning("at the end of the training: %s", finding)
+    return loop.metrics
 
 
 def _open_writer(job: Job, env: Environment) -> CheckpointWriter:

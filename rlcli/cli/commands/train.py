@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -22,6 +23,9 @@ if TYPE_CHECKING:
     from rlcli.training.job import TrainingResult
     from rlcli.training.signals import StopRequest
     from rlcli.training.start_run import TrainingRequest
+
+_GOOD = 0.95
+"""Success rate below which the end of a training suggests a comparison with zero actions."""
 
 
 def command(
@@ -199,6 +203,8 @@ def _print(result: TrainingResult) -> None:
             f"trained {result.new_steps:,} steps in {result.elapsed_s:.1f} s{total};"
             f" next: rlcli play --checkpoint {result.run}"
         )
+    for line in _next_steps(result):
+        console.info(line)
     console.data(str(result.run))
     training = {"iteration": result.iteration, "elapsed_s": result.elapsed_s, "seed": result.seed}
     console.document(
@@ -209,6 +215,20 @@ def _print(result: TrainingResult) -> None:
         step=result.step,
         **{name: value for name, value in training.items() if value is not None},
     )
+
+
+def _next_steps(result: TrainingResult) -> list[str]:
+    """Return what the last success rate or return of the training counts, and how to find out whether it is good."""
+    success, mean_return = (result.metrics.get(f"Train/{name}") for name in ("success_rate", "mean_reward"))
+    if mean_return is None:
+        return []
+    figure = f"return {mean_return:.4g}" if success is None else f"success {success:.1%}"
+    run = shlex.quote(str(result.run))
+    counts = "counts the last episodes of the training, with exploration noise"
+    lines = [f"{figure} {counts}; without noise: rlcli eval --checkpoint {run}"]
+    if success is None or success < _GOOD:
+        lines.append(f"compare it with a policy of zero actions: rlcli eval --compare {run} zero")
+    return lines
 
 
 def _train_seeds(
