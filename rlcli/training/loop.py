@@ -61,10 +61,14 @@ class TrainLoop:
     count_divergences: Callable[[], int] = lambda: 0
     """Function that returns the number of environment steps that have diverged since the environment was built."""
     stop: StopRequest = field(default_factory=StopRequest)
+    deadline: float | None = None
+    """Time at which the training stops, by the monotonic clock [s]; None: no limit."""
     metrics: dict[str, float] = field(init=False, default_factory=dict)
     """Metrics of the newest iteration."""
     reached: bool = field(init=False, default=False)
     """Whether an evaluation has reached the threshold that ends the training (`--until`)."""
+    timed_out: bool = field(init=False, default=False)
+    """Whether the deadline has passed."""
     _ranks: distributed.ProcessGroup = field(init=False, default_factory=distributed.current)
     _boundary: tuple[int, int] = field(init=False, default=(0, 0))
     """Iteration and environment steps at the beginning of the current iteration."""
@@ -133,7 +137,7 @@ class TrainLoop:
             raise self._stopped(f"stopped at iteration {trainer.iteration}, checkpoint written")
 
     def _is_over(self, budget: Budget) -> bool:
-        return self.reached or budget.spent(self.trainer)
+        return self.reached or self.timed_out or budget.spent(self.trainer)
 
     def _check_health(self, metrics: dict[str, float]) -> None:
         """Run the health checks if they are due; log new problems, and write all present problems into run.json."""
@@ -173,8 +177,10 @@ class TrainLoop:
             is_overdue = self.save_interval is None and self._ranks.is_rank_zero and unsaved_s > SAVE_EVERY_S
             new_divergences = self.count_divergences() - diverged_before
             reached = evaluator is not None and evaluator.reached
-            diverged, reached_on, *must_save = self._ranks.sum(new_divergences, reached, is_overdue, is_best)
-            self.reached = bool(reached_on)
+            late = self.deadline is not None and time.monotonic() >= self.deadline
+            ends = reached, late
+            diverged, reached_on, late_on, *must_save = self._ranks.sum(new_divergences, *ends, is_overdue, is_best)
+            self.reached, self.timed_out = bool(reached_on), bool(late_on)
             _require_stable(diverged, trainer)
         return report, evaluation, is_best, any(must_save)
 

@@ -38,6 +38,7 @@ def command(
     num_envs: options.NumEnvs = None,
     max_iterations: options.MaxIterations = None,
     max_steps: options.MaxSteps = None,
+    max_minutes: options.MaxMinutes = None,
     until: Annotated[str | None, typer.Option(metavar="KEY=X")] = None,
     device: options.Device = "auto",
     gpus: Annotated[int | None, typer.Option(min=1)] = None,
@@ -86,7 +87,9 @@ def command(
     console.muted = not distributed.is_rank_zero()
     request = TrainingRequest(runs_dir or default_runs_dir(), None, resume, agent, device, gpus, config)
     request.overrides, request.flags = overrides or [], flags(scene__num_envs=num_envs)
-    request.budget = options.budget_keys(max_iterations, max_steps) | ({} if until is None else {"agent.until": until})
+    ends = {"agent.until": until, "agent.max_minutes": max_minutes}
+    request.budget = options.budget_keys(max_iterations, max_steps)
+    request.budget |= {key: value for key, value in ends.items() if value is not None}
     request.seed = options.random_if_minus_one(42 if seed is None else seed)
     request.loggers, request.init_from, request.video_every, request.name = logger, init_from, video_every, name
     study = _study(request, seeds, jobs, seed)
@@ -163,7 +166,7 @@ def _source(task: str | None, request: TrainingRequest, seed: int | None, seeds:
     if changes:
         raise UsageError(
             f"a resumed run keeps its configuration: {', '.join(changes)} cannot be given with --resume"
-            " (--max-iterations and --max-steps can)",
+            " (--max-iterations, --max-steps, --max-minutes and --until can)",
             hint="to change them, start a new run with the old run's weights: --init-from RUN",
         )
     return source
@@ -210,7 +213,7 @@ def _print(result: TrainingResult) -> None:
     console.document(
         "train",
         run=str(result.run),
-        state="finished",
+        state=result.state,
         checkpoint=str(result.checkpoint),
         step=result.step,
         **{name: value for name, value in training.items() if value is not None},
