@@ -258,8 +258,13 @@ def exploration(health: Health) -> Found:
     if std is None or not health.struggles(0.1):
         return
     start, bound = statistics.fmean(begin[:3]), health.settings.get("action_bound")
+    fallen = f"the standard deviation of actions has fallen from {start:.3g} to {std:.3g}"
+    no_success = health.struggles(0.25) and max(health.values(SUCCESS), default=1.0) < 0.01
     if std < 0.02 * start:
-        yield f"the standard deviation of actions has fallen from {start:.3g} to {std:.3g}", "a larger entropy_coef"
+        yield fallen, "a larger entropy_coef"
+    elif std < start / 6 and no_success and not _approaches(health.values(RETURN)):
+        message = f"{fallen}, the return no longer rises, and no episode succeeds"
+        yield message, "an easier start of episodes, wider limits at first, or a larger entropy_coef"
     if std > 3.0 * (bound or float("inf")) or (std > 1.25 * start and std > (bound or 1.0) and _rises(health)):
         limit = f", and the bound of actions is {bound:g}" if bound else ""
         message = f"the standard deviation of actions is {std:.3g}, {std / start:.1f} times the initial one{limit}"

@@ -236,6 +236,15 @@ def _trapezoid(iteration, peak, end):
     return peak * rise - (peak - end) * fall
 
 
+def test_exploration_that_ends_before_the_first_success_is_named():
+    plateau = {"Train/mean_reward": lambda i: 2.0 + 0.01 * (i % 3), "Policy/mean_std": lambda i: 0.6 if i < 4 else 0.09}
+    found = findings({**FAILING, **plateau}, until=0.5)["exploration"]
+    assert "has fallen from 0.6 to 0.09, the return no longer rises, and no episode succeeds" in found.message
+    assert "exploration" not in findings({**FAILING, **plateau, "Train/success_rate": lambda i: 0.02}, until=0.5)
+    rising = {"Train/mean_reward": HEALTHY["Train/mean_reward"]}
+    assert "exploration" not in findings({**FAILING, **plateau, **rising}, until=0.5)
+
+
 @pytest.mark.parametrize("until", [0.2, 0.25])
 def test_bound_that_no_state_reaches(until):
     """The value comes near its bound while the return rises: only the states tell that the bound is out of reach."""
