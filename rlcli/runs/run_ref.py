@@ -245,7 +245,9 @@ def _find_run(reference: str, runs_dir: Path, task: str | None) -> tuple[Run, st
         if os.path.isfile(candidate / STUDY):
             inside = sorted(file.parent.name for file in candidate.glob(f"*/{RECORD}"))
             message = f"{candidate} is a study of several runs"
-            raise CheckpointError(message, hint=f"name one: {listing(str(candidate / n) for n in inside)}")
+            draws = f"`rlcli plot {candidate}` draws all of them"
+            first = f"name one, such as {candidate / inside[0]} ({listing(inside)}); " if inside else ""
+            raise CheckpointError(message, hint=first + draws)
     runs, broken = _opened(run_folders(runs_dir))
     matches = [run for run in runs if run.folder.name == reference]
     if len(matches) == 1:
