@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import mujoco
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -86,7 +87,10 @@ def regulator(resolved: Resolved, bound: float | None) -> Regulator:
         states, after, observed, rest = _sample_steps(env, resolved)
     dynamics, residual = _fit(states, after)
     if residual.max() > _MAX_RESIDUAL:
-        raise _no_regulator_error(resolved, "position, velocity and action do not determine the next state linearly")
+        why = "position, velocity and action do not determine the next state linearly"
+        if _contacts(env):
+            why += ": contacts open, close or slip near the default state"
+        raise _no_regulator_error(resolved, why)
     nx = after.shape[1]
     decoder, residual = _fit(observed, after)
     if residual.max() > _MAX_RESIDUAL:
@@ -154,7 +158,12 @@ def _sample_steps(env: VecEnv, resolved: Resolved) -> tuple[Matrix, Matrix, Matr
     observed = step.obs["policy"].double().cpu().numpy()
     if np.abs(after[0]).max() > _MAX_DRIFT:
         moved = _coordinates(env)[int(np.abs(after[0]).argmax())]
-        raise _no_regulator_error(resolved, f"its default state is not an equilibrium: {moved} moves")
+        contacts = _contacts(env)
+        why = f"its default state is not an equilibrium: {moved} moves"
+        if contacts:
+            why += f" (contacts there: {contacts}; a body at rest lies slightly inside the body that carries it)"
+        rest = "set scene.entities.NAME.init.joint_pos to a pose at rest, as `rlcli play TASK --policy zero` shows it"
+        raise _no_regulator_error(resolved, why, f"{rest}; or use --policy trained, zero or random")
     success = env.compute_success()
     if success is None or not bool(success[0]):
         raise _no_regulator_error(resolved, "it does not succeed at its default state")
@@ -176,8 +185,13 @@ def _coordinates(env: VecEnv) -> list[str]:
     return [*names, *(f"the velocity of {name}" for name in names)]
 
 
-def _no_regulator_error(resolved: Resolved, why: str) -> UsageError:
-    return UsageError(
-        f"there is no LQR (linear-quadratic regulator) of {resolved.source.name}: {why}",
-        hint="use --policy trained, zero or random",
-    )
+def _contacts(env: VecEnv) -> int:
+    """Return the number of contacts in environment 0."""
+    data = mujoco.MjData(env.engine.model)
+    data.qpos[:] = env.engine.field("qpos")[0].cpu().numpy()
+    mujoco.mj_forward(env.engine.model, data)
+    return int(data.ncon)
+
+
+def _no_regulator_error(resolved: Resolved, why: str, hint: str = "use --policy trained, zero or random") -> UsageError:
+    return UsageError(f"there is no LQR (linear-quadratic regulator) of {resolved.source.name}: {why}", hint=hint)

@@ -285,16 +285,38 @@ def report_lasting_threads() -> None:
                 warn_once(f"{place}: a thread still runs {SLOW_S:g} s after the end of the command; Ctrl-C ends it")
 
 
+class _OwnTime:
+    """Clock of the time in which a thread runs or is blocked, without the time in which it waits for a free CPU.
+
+    Where the kernel does not measure this (not Linux), it is the time since the start.
+    """
+
+    def __init__(self, thread: int) -> None:
+        self._file = Path(f"/proc/self/task/{thread}/schedstat")
+        self._begin, self._waited_s = time.monotonic(), self._wait_s()
+
+    def now(self) -> float:
+        """Return the time since the start of the clock [s]."""
+        return time.monotonic() - self._begin - (self._wait_s() - self._waited_s)
+
+    def _wait_s(self) -> float:
+        try:
+            return int(self._file.read_text().split()[1]) * 1e-9
+        except (OSError, ValueError, IndexError):
+            return 0.0
+
+
 class _Watch(threading.Thread):
     """Thread that looks at the running code once a second, and names calls of a task's code that do not return.
 
     Args:
-        thread: identifier of the thread to watch.
+        thread: identifier of the thread to watch, which must create this object.
     """
 
     def __init__(self, thread: int) -> None:
         super().__init__(name="watch", daemon=True)
         self._watched, self._ended = thread, threading.Event()
+        self._clock = _OwnTime(threading.get_native_id())
         self._reported: set[CodeType] = set()
 
     def end(self) -> None:
@@ -307,7 +329,7 @@ class _Watch(threading.Thread):
         since: dict[FrameType, float] = {}  # the keys keep the frames, so that no new one has the same identity
         while not self._ended.wait(_SAMPLE_S):
             frames = frames_of_thread(self._watched)
-            now = time.monotonic()
+            now = self._clock.now()
             since = {frame: since.get(frame, now) for frame in _calls(frames)}
             call = next((frame for frame, begin in since.items() if now - begin >= SLOW_S - _SAMPLE_S), None)
             if call is not None and call.f_code not in self._reported:

@@ -4,6 +4,7 @@ import importlib.util
 import io
 import math
 import re
+import textwrap
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -34,6 +35,8 @@ _ONE_COLUMN = 8
 """Largest number of entries in a legend with one column; a longer legend has two."""
 _MAX_LABEL = 64
 """Largest length of a label [characters]."""
+_MAX_LINES = 3
+"""Largest number of lines of a label in a legend."""
 _NOT_DRAWN = re.compile(f"{UNSAFE.pattern}|[\t\n\ufffe\uffff]")
 """Characters that a picture cannot show, and characters that change the direction of text."""
 
@@ -201,9 +204,13 @@ def _legend(owner: Any, items: Sequence[Item], *, bands: bool = False, **setting
         Patch(color=_color(item), alpha=0.75) if bands else Line2D([], [], color=_color(item), linestyle=_style(item))
         for item in items
     ]
-    # matplotlib leaves out labels that begin with an underscore
-    labels = [f" {text}" if (text := _text(item.label)).startswith("_") else text for item in items]
-    owner.legend(handles, labels, **settings)
+    owner.legend(handles, [_legend_text(item.label) for item in items], **settings)
+
+
+def _legend_text(label: str) -> str:
+    """Return a label for a legend, on up to three lines: the differences of two runs may be at the end."""
+    text = textwrap.fill(_text(label, _MAX_LINES * _MAX_LABEL), _MAX_LABEL, max_lines=_MAX_LINES, placeholder=" …")
+    return f" {text}" if text.startswith("_") else text  # matplotlib leaves out labels that begin with an underscore
 
 
 def _bytes(figure: Any, kind: str, *, transparent: bool = False) -> bytes:

@@ -198,6 +198,19 @@ def _newest_valid(run: Run, have: list[int], why: str, whole: bool) -> tuple[Pat
     raise AssertionError("bug in rlcli: find_checkpoint must not pass a run without checkpoints")
 
 
+def _is_of_sweep(run: Run) -> bool:
+    """Return whether a run is in the folder of a sweep."""
+    from rlcli.runs.study import read_study
+
+    if not (run.folder.parent / STUDY).is_file():
+        return False
+    try:
+        read_study(run.folder.parent, "sweep")
+    except CheckpointError:
+        return False
+    return True
+
+
 def default_runs_dir() -> Path:
     """Return the folder of runs: RLCLI_RUNS_DIR, else the user's setting, else `runs` in the current folder."""
     return Path(os.environ.get("RLCLI_RUNS_DIR") or os.path.expanduser(setting("runs_dir") or "runs"))
@@ -216,20 +229,25 @@ def _find_run(reference: str, runs_dir: Path, task: str | None) -> tuple[Run, st
             )
             hint = "; ".join(filter(None, (near, f"rlcli train {task or 'TASK'} starts one")))
             raise CheckpointError(f"there is no run{of_task} in {runs_dir.absolute()}", hint=hint)
-        if seconds_since(runs[-1].record.get("started")) < -60:
+        # trials of a sweep, pruned ones and trainings with poor settings among them, are used by name only
+        newest = next((run for run in reversed(runs) if not _is_of_sweep(run)), runs[-1])
+        if seconds_since(newest.record.get("started")) < -60:
             _log.warning(
-                f"{runs[-1].folder} started in the future by this machine's clock, so that `latest` may not be the run"
+                f"{newest.folder} started in the future by this machine's clock, so that `latest` may not be the run"
                 " that was started last; name the run"
             )
         _warn_of_skipped(refused)
-        return runs[-1], f"newest run of {task}" if task else f"newest run in {runs_dir}"
+        what = "newest trial of a sweep" if _is_of_sweep(newest) else "newest run"
+        return newest, f"{what} of {task}" if task else f"{what} in {runs_dir}"
     for candidate in (path_of(reference), runs_dir / reference, *([runs_dir / task / reference] if task else [])):
         if os.path.isfile(candidate / RECORD):
             return open_run(candidate), "as named"
         if os.path.isfile(candidate / STUDY):
             inside = sorted(file.parent.name for file in candidate.glob(f"*/{RECORD}"))
             message = f"{candidate} is a study of several runs"
-            raise CheckpointError(message, hint=f"name one: {listing(str(candidate / n) for n in inside)}")
+            draws = f"`rlcli plot {candidate}` draws all of them"
+            first = f"name one, such as {candidate / inside[0]} ({listing(inside)}); " if inside else ""
+            raise CheckpointError(message, hint=first + draws)
     runs, broken = _opened(run_folders(runs_dir))
     matches = [run for run in runs if run.folder.name == reference]
     if len(matches) == 1:

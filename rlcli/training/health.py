@@ -107,7 +107,8 @@ class Health:
             if condition is not None and f"Success/{name}" in metrics:
                 value = metrics.get(f"Success_Value/{name}")
                 bound = "" if value is None else f", value {value:.3g}, {bound_text(condition.model_dump())}"
-                lines.append(f"success in training: {name} held in {metrics[f'Success/{name}']:.1%}{bound}{reached}")
+                held = f"{metrics[f'Success/{name}']:.1%}"
+                lines.append(f"success in this iteration's episodes: {name} held in {held}{bound}{reached}")
         return lines
 
     def names(self, prefix: str) -> list[str]:
@@ -216,11 +217,12 @@ def one_termination(health: Health) -> Found:
     Their lengths are compared with those at the start, or with those in the middle of the training.
     """
     late = {name for name, term in health.task.terminations.items() if term is not None and term.time_out}
+    complete = [v for n in late | {"time_out"} for v in _newer_half(health.values(f"Episode_Termination/{n}"))]
     for metric in health.names("Episode_Termination/"):
         name, share = metric.partition("/")[2], health.median(metric)
         if name in late | {"time_out"} or share is None or share < 0.99 or not health.struggles(0.15):
             continue
-        early = health.change(LENGTH) < 1.0
+        early = health.change(LENGTH) < 1.0 and max(complete, default=0.0) < 0.05
         if (early or _stalled(health)) and not _approaches(health.values(RETURN)):
             length = statistics.fmean(health.last(LENGTH))
             since = "at first" if early else "in the middle of the training so far, and none succeeds"
@@ -256,8 +258,13 @@ def exploration(health: Health) -> Found:
     if std is None or not health.struggles(0.1):
         return
     start, bound = statistics.fmean(begin[:3]), health.settings.get("action_bound")
+    fallen = f"the standard deviation of actions has fallen from {start:.3g} to {std:.3g}"
+    no_success = health.struggles(0.25) and max(health.values(SUCCESS), default=1.0) < 0.01
     if std < 0.02 * start:
-        yield f"the standard deviation of actions has fallen from {start:.3g} to {std:.3g}", "a larger entropy_coef"
+        yield fallen, "a larger entropy_coef"
+    elif std < start / 6 and no_success and not _approaches(health.values(RETURN)):
+        message = f"{fallen}, the return no longer rises, and no episode succeeds"
+        yield message, "an easier start of episodes, wider limits at first, or a larger entropy_coef"
     if std > 3.0 * (bound or float("inf")) or (std > 1.25 * start and std > (bound or 1.0) and _rises(health)):
         limit = f", and the bound of actions is {bound:g}" if bound else ""
         message = f"the standard deviation of actions is {std:.3g}, {std / start:.1f} times the initial one{limit}"
@@ -334,7 +341,7 @@ def actions_at_bound(health: Health) -> Found:
 
 
 def blocked_success(health: Health) -> Found:
-    """Report a success condition that blocks success: it holds much less often than the others, or never."""
+    """Report a success condition that blocks success: it holds much less often than the others, or no longer."""
     for name, condition in health.task.success.items():
         held, values = health.median(f"Success/{name}"), health.values(f"Success_Value/{name}")
         if held is None or condition is None or not health.struggles(0.15):
@@ -342,13 +349,15 @@ def blocked_success(health: Health) -> Found:
         others = [health.median(n) or 0.0 for n in health.names("Success/") if n != f"Success/{name}"]
         alone = bool(others) and min(others) > 0.5 and held < 0.1 * min(others) and health.progress == 1.0
         learned = health.change(RETURN) > 1.0 and not _approaches(health.values(RETURN))
-        never = max(health.values(f"Success/{name}")) == 0.0 and (learned or health.progress == 1.0)
+        shares = health.values(f"Success/{name}")
+        # a random policy may have met the condition at the beginning
+        never = not any(_newer_half(shares)) and (learned or health.progress == 1.0)
         gaps, states = _gaps(values, condition.model_dump()), health.values(f"Health/held/{name}")
         # the mean is near the bound, but no environment is within it in any of the states at the checks
         halved = _halved(gaps)
         # an error that must be exactly 0
         exact = bool(values) and condition.at_most is not None and condition.at_most <= 0.0 < min(values)
-        unmet = not any(health.values(f"Success/{name}")) and len(states) > 2 and not any(states)
+        unmet = not any(shares) and len(states) > 2 and not any(states)
         if (never and not _approaches(gaps)) or alone or (unmet and (halved or exact)):
             value = f"; its value is {statistics.fmean(values[-3:]):.3g}" if values else ""
             bound = f"; it must be {text}" if (text := bound_text(condition.model_dump())) else ""
@@ -383,10 +392,28 @@ def reward_against_success(health: Health) -> Found:
     yield message, "other signs or weights of the rewards, or a reward for success"
 
 
+def falling_success(health: Health) -> Found:
+    """Report a success rate that has fallen below half of its best value, both averaged over some iterations."""
+    values, size = health.values(SUCCESS), len(health.last(SUCCESS))
+    if len(values) < _MIN_VALUES:
+        return
+    means = [statistics.fmean(values[end - size : end]) for end in range(size, len(values) + 1)]
+    if max(means) >= _SOLVED and means[-1] < 0.5 * max(means):
+        best, now = max(means), means[-1]
+        hint = "a smaller agent.learning_rate or desired_kl, a larger entropy_coef"
+        if any(health.task.curriculum.values()):
+            hint += ", a slower curriculum"
+        yield f"the success rate has fallen from {best:.1%} to {now:.1%}", f"{hint}, or a checkpoint before the fall"
+
+
 def _gaps(values: list[float], bounds: Mapping[str, Any]) -> list[float]:
     """Return minus the distance of each value to the range `at_least` to `at_most`; 0 within the range."""
     low, high = bounds.get("at_least"), bounds.get("at_most")
     return [-max((low if low is not None else v) - v, v - (high if high is not None else v), 0.0) for v in values]
+
+
+def _newer_half(values: list[float]) -> list[float]:
+    return values[len(values) // 2 :]
 
 
 def _halved(gaps: list[float]) -> bool:
@@ -407,7 +434,7 @@ def _approaches(values: list[float]) -> bool:
 _IN_ORDER: tuple[Callable[[Health], Found], ...] = (
     *(no_reward, short_episodes, observations, update_size, learning_rate_range, exploration, dying_pays),
     *(one_termination, value_function, actions_at_bound, blocked_success, reward_without_success),
-    *(reward_against_success, no_progress),
+    *(reward_against_success, falling_success, no_progress),
 )
 CHECKS = {check.__name__.replace("_", "-"): check for check in _IN_ORDER}
 """Name -> check function, in the order in which findings are listed."""

@@ -70,6 +70,10 @@ class TrainingResult:
     seed: int | None = None
     new_steps: int | None = None
     """Environment steps of this training; for a resumed run, without those before."""
+    metrics: dict[str, float] = field(default_factory=dict)
+    """Metrics of the last iteration."""
+    state: str = "finished"
+    """finished, or stopped if the agent's `max_minutes` ended the training."""
 
 
 def threads(resolved: Resolved) -> tuple[int, int]:

@@ -6,9 +6,10 @@ import contextlib
 import logging
 import shlex
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rlcli.errors import DivergedError, MachineError, Stopped
 from rlcli.rl import distributed
@@ -19,7 +20,7 @@ from rlcli.runs.run import Run
 from rlcli.training.checkpoint_writer import CheckpointWriter
 from rlcli.training.health import Health, probe
 from rlcli.training.periodic_eval import PeriodicEval
-from rlcli.training.progress import Progress
+from rlcli.training.progress import Progress, progress_from_metrics
 from rlcli.training.signals import Interrupted, StopRequest
 
 if TYPE_CHECKING:
@@ -32,6 +33,8 @@ SAVE_EVERY_S = 60.0
 """Time between checkpoints without a `save_interval` [s]."""
 LONG_S = 0.1
 """Duration of an iteration above which the next can be interrupted: the state before it is copied [s]."""
+RECENT = 100
+"""Number of iterations whose mean duration gives the time left."""
 DIVERGED_SHARE = 0.01
 """Share of an iteration's environment steps that may diverge before the run stops."""
 
@@ -58,15 +61,21 @@ class TrainLoop:
     count_divergences: Callable[[], int] = lambda: 0
     """Function that returns the number of environment steps that have diverged since the environment was built."""
     stop: StopRequest = field(default_factory=StopRequest)
+    deadline: float | None = None
+    """Time at which the training stops, by the monotonic clock [s]; None: no limit."""
     metrics: dict[str, float] = field(init=False, default_factory=dict)
     """Metrics of the newest iteration."""
     reached: bool = field(init=False, default=False)
     """Whether an evaluation has reached the threshold that ends the training (`--until`)."""
+    timed_out: bool = field(init=False, default=False)
+    """Whether the deadline has passed."""
     _ranks: distributed.ProcessGroup = field(init=False, default_factory=distributed.current)
     _boundary: tuple[int, int] = field(init=False, default=(0, 0))
     """Iteration and environment steps at the beginning of the current iteration."""
     _iteration_s: float = field(init=False, default=0.0)
     """Duration of the last iteration [s]."""
+    _recent: deque[dict[str, Any]] = field(init=False, default_factory=lambda: deque(maxlen=RECENT))
+    """Rows of the newest iterations, as in `metrics.jsonl`."""
     _saved_at: float = field(init=False, default_factory=time.monotonic)
 
     def train(self, budget: Budget) -> None:
@@ -102,15 +111,17 @@ class TrainLoop:
         if writer.newest is None:
             self._save()
             writer.wait()
-        begin, first_step = time.monotonic(), trainer.env_steps
+        begin = time.monotonic()
         # a signal on any rank stops all ranks at the same boundary
         while not (stopped := any(self._ranks.sum(self.stop.signal is not None))) and not self._is_over(budget):
             report, evaluation, is_best, must_save = self._iterate()
             self.metrics = metrics = {**_with_rates(report, trainer.steps_per_iteration), **evaluation}
+            now = time.monotonic()
+            metrics["Perf/iteration_time"], begin = now - begin, now
             for logger in self.loggers:
                 logger.write(trainer.iteration, trainer.env_steps, metrics)
             self._check_health(metrics)
-            self.show(self._progress(budget, report, metrics, time.monotonic() - begin, first_step))
+            self.show(self._progress(budget, metrics))
             if must_save or writer.is_due(trainer.iteration, self.save_interval):
                 self._save()
             if is_best:
@@ -126,7 +137,7 @@ class TrainLoop:
             raise self._stopped(f"stopped at iteration {trainer.iteration}, checkpoint written")
 
     def _is_over(self, budget: Budget) -> bool:
-        return self.reached or budget.spent(self.trainer)
+        return self.reached or self.timed_out or budget.spent(self.trainer)
 
     def _check_health(self, metrics: dict[str, float]) -> None:
         """Run the health checks if they are due; log new problems, and write all present problems into run.json."""
@@ -166,8 +177,10 @@ class TrainLoop:
             is_overdue = self.save_interval is None and self._ranks.is_rank_zero and unsaved_s > SAVE_EVERY_S
             new_divergences = self.count_divergences() - diverged_before
             reached = evaluator is not None and evaluator.reached
-            diverged, reached_on, *must_save = self._ranks.sum(new_divergences, reached, is_overdue, is_best)
-            self.reached = bool(reached_on)
+            late = self.deadline is not None and time.monotonic() >= self.deadline
+            ends = reached, late
+            diverged, reached_on, late_on, *must_save = self._ranks.sum(new_divergences, *ends, is_overdue, is_best)
+            self.reached, self.timed_out = bool(reached_on), bool(late_on)
             _require_stable(diverged, trainer)
         return report, evaluation, is_best, any(must_save)
 
@@ -205,16 +218,13 @@ class TrainLoop:
                 self.writer.newest = boundary
         self._saved_at = time.monotonic()
 
-    def _progress(
-        self, budget: Budget, report: Report, metrics: dict[str, float], elapsed_s: float, first_step: int
-    ) -> Progress:
-        """Return the progress after an iteration of a training that started at `first_step` environment steps."""
-        trainer, iterations = self.trainer, budget.iterations(self.trainer)
-        rate = (trainer.env_steps - first_step) / max(elapsed_s, 1e-9)
-        left = (iterations - trainer.iteration) * trainer.steps_per_iteration / max(rate, 1e-9)
-        done = trainer.iteration, iterations, trainer.env_steps
-        notes = [] if self.health is None else [*self.health.notes(metrics), *self.run.findings()]
-        return Progress(*done, elapsed_s, left, rate, report.seconds, metrics, notes)
+    def _progress(self, budget: Budget, metrics: dict[str, float]) -> Progress:
+        """Return the progress after an iteration with these metrics."""
+        trainer = self.trainer
+        self._recent.append({**metrics, "iteration": trainer.iteration, "step": trainer.env_steps})
+        progress = progress_from_metrics([*self._recent], budget.iterations(trainer))
+        progress.notes = [] if self.health is None else [*self.health.notes(metrics), *self.run.findings()]
+        return progress
 
     def _stopped(self, message: str) -> Stopped:
         """Return the error of a stopped run, with the command that resumes it."""

@@ -20,7 +20,6 @@ class Progress:
     iterations: int | None
     """Iterations of the whole training; None: unknown."""
     env_steps: int
-    elapsed_s: float
     remaining_s: float | None
     """Estimated remaining time [s]; None: unknown."""
     steps_per_s: float
@@ -31,29 +30,33 @@ class Progress:
     """Conditions of success with their values, and findings of the health checks."""
 
 
-def progress_from_metrics(rows: Sequence[Mapping[str, Any]], iterations: int | None, elapsed_s: float) -> Progress:
-    """Return the progress of a run from the newest rows of its `metrics.jsonl`; the speed is the mean over these rows.
+def progress_from_metrics(rows: Sequence[Mapping[str, Any]], iterations: int | None) -> Progress:
+    """Return the progress of a run from the newest rows of its `metrics.jsonl`.
+
+    The speed is the mean over all rows but the oldest: the first iteration of a training also compiles and warms up.
 
     Args:
         rows: the rows, at least one, oldest first.
         iterations: iterations of the whole training; None: unknown.
-        elapsed_s: duration of the training so far [s].
     """
-    last = rows[-1]
+    last, newer = rows[-1], rows[1:] or rows
     metrics = {k: v for k, v in last.items() if type(v) in (int, float) and k not in ("iteration", "step")}
-    duration = sum(_number(row, "Perf/collection_time") + _number(row, "Perf/learning_time") for row in rows)
-    # steps before the iteration of the first row, whose duration counts, too
-    before = rows[0]["step"] - rows[0]["step"] // max(1, rows[0]["iteration"])
+    duration = sum(map(_iteration_s, newer))
+    # steps before the iteration of the first row whose duration counts
+    before = rows[0]["step"] if len(rows) > 1 else last["step"] - last["step"] // max(1, last["iteration"])
     rate = (last["step"] - before) / duration if duration > 0.0 else 0.0
-    steps_per_iteration = last["step"] / max(1, last["iteration"])
     left = None
     if iterations is not None and rate > 0.0:
-        done = max(1, last["iteration"])
-        # the rows do not count the time of videos and checkpoints, `elapsed_s` does
-        left = max(0, iterations - done) * max(steps_per_iteration / rate, elapsed_s / done)
+        left = max(0, iterations - last["iteration"]) * duration / len(newer)
         left = left if left < _FOREVER_S else None
     seconds = {part: _number(last, f"Perf/{part}_share") for part in PARTS}
-    return Progress(last["iteration"], iterations, last["step"], elapsed_s, left, rate, seconds, metrics)
+    return Progress(last["iteration"], iterations, last["step"], left, rate, seconds, metrics)
+
+
+def _iteration_s(row: Mapping[str, Any]) -> float:
+    """Return the duration of an iteration; older runs did not measure the time of videos and checkpoints."""
+    measured = _number(row, "Perf/iteration_time")
+    return measured or _number(row, "Perf/collection_time") + _number(row, "Perf/learning_time")
 
 
 def _number(row: Mapping[str, Any], name: str) -> float:

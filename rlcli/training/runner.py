@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import shlex
 import time
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, Protocol
@@ -74,7 +75,7 @@ def run_training(
         CrashDumper(env, run.folder / "dumps")
     first_step = trainer.env_steps
     try:
-        _train(job, trainer, env, stop, view)
+        loop = _train(job, trainer, env, stop, view)
     finally:
         run.unlock()
         env.close()
@@ -82,12 +83,17 @@ def run_training(
     if not job.writes:
         return None
     newest = run.checkpoints / f"{steps(run.checkpoints)[-1]:012d}"
-    elapsed, seed, step = time.monotonic() - job.begin, run.record["seed"], trainer.env_steps
-    return TrainingResult(run.folder, newest, step, trainer.iteration, elapsed, seed, step - first_step)
+    elapsed, step, new_steps = time.monotonic() - job.begin, trainer.env_steps, trainer.env_steps - first_step
+    ended = loop.metrics, run.record["state"]
+    return TrainingResult(run.folder, newest, step, trainer.iteration, elapsed, run.record["seed"], new_steps, *ended)
 
 
-def _train(job: Job, trainer: Trainer, env: Environment, stop: StopRequest, view: ProgressView) -> None:
-    """Open loggers and checkpoints, run the loop, and record in the run how it ended."""
+def _train(job: Job, trainer: Trainer, env: Environment, stop: StopRequest, view: ProgressView) -> TrainLoop:
+    """Open loggers and checkpoints, run the loop, and record in the run how it ended.
+
+    Returns:
+        The loop, after the training.
+    """
     run, (agent, _) = job.run, job.resolved.require_agent()
     budgets = [Budget(end, None) for end in job.stages] or [Budget(agent.max_iterations, agent.max_steps)]
     writer = _open_writer(job, env)
@@ -121,6 +127,7 @@ def _train(job: Job, trainer: Trainer, env: Environment, stop: StopRequest, view
             show=view.show,
             count_divergences=lambda: env.divergences,
             stop=stop,
+            deadline=None if agent.max_minutes is None else job.begin + 60.0 * agent.max_minutes,
         )
         env.observers.add(stop)
         stop.can_interrupt = not env.engine.asynchronous
@@ -131,7 +138,11 @@ def _train(job: Job, trainer: Trainer, env: Environment, stop: StopRequest, view
         with contextlib.suppress(OSError, RlcliError):  # the first error is the one to report
             close(*_end_state(error))
         raise
-    close("finished")
+    is_done = loop.reached or budgets[-1].spent(trainer)
+    close("finished" if is_done else "stopped")
+    if not is_done:
+        again = f"rlcli train --resume {shlex.quote(str(run.folder))} continues it"
+        _log.info(f"stopped after {agent.max_minutes:g} minutes, in iteration {trainer.iteration}; {again}")
     if job.writes and agent.until is not None:
         _report_bar(run, agent.until, loop.reached)
     # after a passed evaluation, the few episodes that ended in training are mostly failures of older policies
@@ -139,6 +150,7 @@ def _train(job: Job, trainer: Trainer, env: Environment, stop: StopRequest, view
         _log.info("%s", note)
     for finding in run.findings() if job.writes else ():
         _log.warning("at the end of the training: %s", finding)
+    return loop
 
 
 def _open_writer(job: Job, env: Environment) -> CheckpointWriter:

@@ -13,6 +13,7 @@ from rlcli.config.dump import to_data, to_yaml
 from rlcli.config.strict_yaml import MAX_BYTES
 from rlcli.errors import CheckpointError, DivergedError, RlcliError, UsageError
 from rlcli.evaluation.limits import require_success
+from rlcli.progress import track
 from rlcli.runs.overview import newest_rows, overview
 from rlcli.runs.run import CONFIG, Run
 from rlcli.runs.safe_io import read_file
@@ -150,8 +151,11 @@ def compare(
         if resolved.agent is not None and not resolved.agent.eval_interval:
             base.overrides.append("agent.eval_interval=1")
         base.overrides.append(f"agent.eval_episodes={episodes}")
+        count, agent = len(ARMS) * len(seeds), resolved.require_agent()[0]
+        budget = f"{agent.max_iterations:,} iterations" if agent.max_iterations else f"{agent.max_steps:,} steps"
+        _log.info(f"{count} trainings, each of at most {budget}; fewer --seeds or --max-iterations N shorten this")
         changes: dict[str, list[str]] = {"default": [], "best": sweep.overrides(sweep.values(best))}
-        with stop:
+        with stop, track("trainings", count) as work:
             for turn, seed in enumerate(seeds):
                 # alternate, so that a slow period of the machine affects both settings
                 for arm in ARMS if turn % 2 == 0 else reversed(ARMS):
@@ -160,6 +164,7 @@ def compare(
                     training = _train(comparison, replace(base, seed=seed), arm, changes[arm], stop)
                     if training.reached or training.error or stop.signal is None:  # else a signal stopped this training
                         comparison.trainings.append(training)
+                    work.advance()
     if stop.signal is not None and len(comparison.trainings) < len(ARMS) * len(seeds):
         comparison.stop_code = stop.exit_code
     return comparison

@@ -3,7 +3,7 @@
 import logging
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,6 +11,7 @@ from rlcli.config.dump import preset_of
 from rlcli.config.load import Resolved
 from rlcli.errors import INTERRUPTED, STOPPED, DivergedError, RlcliError, UsageError, did_you_mean, listing
 from rlcli.evaluation.limits import require_success
+from rlcli.progress import track
 from rlcli.runs.overview import newest_rows, overview
 from rlcli.runs.run import Run, open_run
 from rlcli.training.signals import StopRequest
@@ -122,30 +123,37 @@ class TrialRunner:
         Raises:
             RlcliError: if the first trials all fail, or for an error that no trial has caused (a full disk).
         """
+        before = len(self._sweep.ended())
         try:
-            while True:
-                stopping = self._stop.signal is not None
-                while not stopping and len(self._active) < self._jobs:
-                    trial = self._sweep.claim()
-                    if trial is None:
-                        break
-                    self._active.append(self._start(trial))
-                if not self._active:
-                    break
-                for stage in list(self._active):
-                    if stopping:
-                        stage.process.stop()
-                    if stage.process.has_ended():
-                        self._active.remove(stage)
-                        self._end(stage, stopping)
-                    elif not stopping:
-                        self._watch(stage)
-                time.sleep(POLL_S)
+            with track("trials", max(1, self._sweep.settings["trials"] - before)) as work:
+                stopping = self._run_all(lambda: work.update(len(self._sweep.ended()) - before, 0.0))
         finally:
             for stage in self._active:
                 stage.process.process.kill()
         if self._failures and not stopping and self._sweep.best() is None:
             raise self._all_failed()
+
+    def _run_all(self, on_end: Callable[[], None]) -> bool:
+        """Run trials; `on_end` is called after each stage of a trial. Return whether a signal has stopped them."""
+        while True:
+            stopping = self._stop.signal is not None
+            while not stopping and len(self._active) < self._jobs:
+                trial = self._sweep.claim()
+                if trial is None:
+                    break
+                self._active.append(self._start(trial))
+            if not self._active:
+                return stopping
+            for stage in list(self._active):
+                if stopping:
+                    stage.process.stop()
+                if stage.process.has_ended():
+                    self._active.remove(stage)
+                    self._end(stage, stopping)
+                    on_end()
+                elif not stopping:
+                    self._watch(stage)
+            time.sleep(POLL_S)
 
     def _start(self, trial: Trial) -> _Stage:
         """Start or resume the training of a trial, or start the evaluation of a trained one."""

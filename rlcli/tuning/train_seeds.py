@@ -70,6 +70,8 @@ def resume_options(request: TrainingRequest) -> list[str]:
     values = {
         "--max-iterations": request.budget.get("agent.max_iterations"),
         "--max-steps": request.budget.get("agent.max_steps"),
+        "--max-minutes": request.budget.get("agent.max_minutes"),
+        "--until": request.budget.get("agent.until"),
         "--video-every": request.video_every,
     }
     options = [word for option, value in values.items() if value is not None for word in (option, str(value))]

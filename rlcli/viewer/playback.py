@@ -5,6 +5,7 @@ of the simulation executes the requests between two steps (`advance`), so that n
 """
 
 import logging
+import math
 import time
 from collections import deque
 from collections.abc import Callable
@@ -55,6 +56,8 @@ class Playback:
     """Switch to each new checkpoint as soon as it appears."""
     max_advance_s: float = 0.1
     """Time after which `advance` returns to the viewer, even if steps are still due [s]."""
+    longest_s: float | None = None
+    """Time after which the viewer closes, by the clock [s]; None: no limit."""
     initial_obs: Tensor | None = None
     """Current observations of an environment whose episodes continue; None: the environment is reset."""
     steps: int = 0
@@ -297,7 +300,7 @@ class Playback:
 
 
 def run_in_real_time(playback: Playback, is_open: Callable[[], bool], draw: Callable[[], None]) -> None:
-    """Run the playback and draw it 60 times a second until the viewer is closed.
+    """Run the playback and draw it 60 times a second until the viewer is closed or its `longest_s` are over.
 
     Viewers use this loop and do not call `Playback.advance`.
 
@@ -308,7 +311,8 @@ def run_in_real_time(playback: Playback, is_open: Callable[[], bool], draw: Call
             read `playback.env`. Another thread of a viewer may read only `playback.view`.
     """
     before, refreshed = time.perf_counter(), 0.0
-    while is_open():
+    end = math.inf if playback.longest_s is None else before + playback.longest_s
+    while is_open() and before < end:
         now = time.perf_counter()
         if now - refreshed > _REFRESH_S:
             playback.refresh_checkpoints()

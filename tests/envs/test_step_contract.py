@@ -365,9 +365,11 @@ def test_step_rejects_nonfinite_or_misshaped_actions(tmp_path):
     env.step(idle(env))
 
 
-def test_success_requires_condition_until_time_out(tmp_path):
+@pytest.mark.parametrize(("hold_s", "succeeds"), [(0.1, [True, True, False, False]), (0.0, [True, True, True, False])])
+def test_success_requires_condition_until_time_out(tmp_path, hold_s, succeeds):
+    """A condition without a time must hold in the last step."""
     task = world(tmp_path, terminations=BEYOND,
-                 success={"near": {"func": "joint_error", "at_most": 0.5, "hold_s": 0.1}})  # fmt: skip
+                 success={"near": {"func": "joint_error", "at_most": 0.5, "hold_s": hold_s}})  # fmt: skip
     env = build(task, 4)
     env.reset()
     for step in range(10):
@@ -376,7 +378,7 @@ def test_success_requires_condition_until_time_out(tmp_path):
         for i, angle in enumerate(angles):
             env.engine.field("qpos")[i, 0] = angle
         result = env.step(idle(env))
-    assert result.episodes.success.tolist() == [True, True, False, False]
+    assert result.episodes.success.tolist() == succeeds
 
 
 def test_missing_device_raises_device_error(tmp_path):

@@ -99,6 +99,12 @@ def test_regulator_balances_the_cartpoles(name):
             '<body name="arm" pos="0 0 1"><joint name="swing" axis="0 1 0"/><geom size="0.1" pos="0.3 0 0"/></body>',
             "not an equilibrium: the velocity of swing moves",
         ),
+        (
+            [],
+            '<body name="cup" pos="0 0 1"><joint name="cup" type="slide" axis="0 1 0"/><geom size="0.1"/></body>'
+            '<body name="ball" pos="0 0 1.19"><joint name="ball" type="slide" axis="0 0 1"/><geom size="0.1"/></body>',
+            "the velocity of ball moves (contacts there: 1;",
+        ),
     ],
 )
 def test_regulator_refuses_a_task_with_the_reason(task, overrides, more, output):

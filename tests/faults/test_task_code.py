@@ -1,9 +1,16 @@
 """Code of a task that hangs, warns, or raises errors of the system: each is reported once, with its file and line."""
 
+import os
+import subprocess
+import sys
+import threading
 import time
+from pathlib import Path
 
 import pytest
 from support.command_line import COIN, COIN_TASK
+
+from rlcli.registry.task_code_monitor import _OwnTime
 
 pytestmark = [pytest.mark.usefixtures("empty_folder"), pytest.mark.processes]
 
@@ -63,9 +70,33 @@ def test_hook_that_hangs_is_named(with_code, start, tmp_path, hook, words):
     assert "has not returned" not in process.stderr.read()
 
 
+@pytest.mark.skipif(not Path("/proc/self/schedstat").exists(), reason="the kernel does not measure waiting threads")
+def test_clock_of_a_hanging_call_leaves_out_the_wait_for_a_cpu():
+    """Four processes share one CPU: each runs for about a quarter of the time, and a sleeping thread waits for none."""
+    cpu = min(os.sched_getaffinity(0))
+    code = f"import os; os.sched_setaffinity(0, [{cpu}])\nwhile True: pass"
+    rivals = [subprocess.Popen([sys.executable, "-c", code]) for _ in range(3)]
+    own = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, [cpu])
+    try:
+        clock, begin = _OwnTime(threading.get_native_id()), time.monotonic()
+        while time.monotonic() - begin < 2.0:
+            pass
+        busy, wall = clock.now(), time.monotonic() - begin
+        assert busy < 0.6 * wall
+    finally:
+        os.sched_setaffinity(0, own)
+        for rival in rivals:
+            rival.kill()
+            rival.wait()
+    clock, begin = _OwnTime(threading.get_native_id()), time.monotonic()
+    time.sleep(0.5)
+    assert clock.now() > 0.45
+
+
 @pytest.mark.slow
 def test_import_of_a_task_that_hangs_is_named(coin, tmp_path, start):
-    (tmp_path / "coin" / "task.py").write_text("import time\ntime.sleep(600)\n")
+    (tmp_path / "coin" / "task.py").write_text(f"import time\ntime.sleep(600)\n{COIN_TASK}")
     process = start("validate", "./coin", "--deep", "-q")
     assert "coin/task.py:2: <module> has not returned for 10 s" in process.stderr.readline()
 

@@ -10,6 +10,7 @@ from support.written_runs import learning, write_metrics, write_run
 from rlcli.errors import CheckpointError, UsageError
 from rlcli.reporting.curve_panels import choose
 from rlcli.reporting.curves import align, gather, interval, iqm, read_history
+from rlcli.reporting.matplotlib_plots import _legend_text
 
 
 def column(*values):
@@ -156,6 +157,15 @@ def test_label_names_three_settings(tmp_path):
     labels = [curve.label for curve in gather(runs)[0]]
     assert all("and 2 more" in label for label in labels)
     assert len(set(labels)) == 2
+
+
+def test_label_in_a_legend_has_several_lines_instead_of_being_cut():
+    setting = "agents.ppo.learning_rate=0.0013159490962126022, "
+    labels = [setting * 2 + f"rewards.alive.weight={weight}" for weight in (1, 2)]
+    lines = [_legend_text(label).split("\n") for label in labels]
+    assert [" ".join(each) for each in lines] == labels
+    assert max(len(line) for each in lines for line in each) <= 64
+    assert _legend_text("x" * 300).endswith("…")
 
 
 def test_duplicate_seed_is_dropped_and_short_run_noted(tmp_path):

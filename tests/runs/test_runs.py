@@ -97,6 +97,20 @@ def test_latest_is_the_newest_run_of_the_task(tmp_path):
     assert "newest run of cartpole" in why
 
 
+def test_latest_is_a_trial_of_a_sweep_only_without_other_runs(tmp_path):
+    trial = make_run(tmp_path).folder
+    sweep = trial.parent / "sweep-x"
+    sweep.mkdir()
+    (sweep / "study.json").write_text('{"kind": "sweep", "task": "cartpole"}')
+    trial.rename(sweep / "trial-0000")
+    run, why = find_run("latest", tmp_path, "cartpole")
+    assert (run.folder.name, why) == ("trial-0000", "newest trial of a sweep of cartpole")
+    alone = make_run(tmp_path).folder
+    record = json.loads((alone / "run.json").read_text())
+    (alone / "run.json").write_text(json.dumps({**record, "started": "2001-01-01T00:00:00+00:00"}))
+    assert find_run("latest", tmp_path)[0].folder == alone
+
+
 def test_find_run_by_name_and_by_folder(tmp_path):
     run = make_run(tmp_path, name="one")
     for reference in (run.folder.name, str(run.folder), f"cartpole/{run.folder.name}"):

@@ -67,6 +67,17 @@ def test_termination_of_all_episodes_is_named_if_their_length_stalls_after_a_ris
     assert "one-termination" not in findings({**changes, "Train/success_rate": lambda i: 0.01}, until=0.6)
 
 
+@pytest.mark.parametrize(("time_outs_in", "named"), [(15, False), (2, True)])
+def test_termination_of_all_episodes_is_silent_if_some_reached_the_time_out(time_outs_in, named):
+    """`cartpole` with `sb3-ppo` and seed 3 learns, although its episodes are as short as at first for 30 iterations."""
+    changes = {
+        "Train/mean_episode_length": lambda i: 100.0 + i % 3,
+        "Episode_Termination/time_out": lambda i: 0.1 * (i == time_outs_in),
+        "Episode_Termination/cart_out_of_bounds": lambda i: 1.0 - 0.1 * (i == time_outs_in),
+    }
+    assert ("one-termination" in findings({**FAILING, **STILL, **changes})) is named
+
+
 @pytest.mark.parametrize("until", [0.1, 0.25, 0.5, 1.0])
 def test_healthy_training_has_no_finding(until):
     assert findings({}, until=until) == {}
@@ -146,6 +157,14 @@ def test_condition_that_blocks_success_is_named_with_its_value():
     assert "at most 0.1" in found["blocked-success"].message
 
 
+@pytest.mark.parametrize(("held_in", "named"), [(2, True), (35, False)])
+def test_condition_that_a_random_policy_met_once_is_named(held_in, named):
+    """Only the newer half of the 40 iterations counts."""
+    plateau = {"Train/mean_reward": lambda i: 5.0 - 7.0 * 0.8**i, "Success_Value/pole": lambda i: 0.3}
+    once = {"Success/pole": lambda i: 0.01 * (i == held_in)}
+    assert ("blocked-success" in findings({**FAILING, **plateau, **once}, until=0.5)) is named
+
+
 def test_every_check_is_on_the_page():
     page = (Path(__file__).parents[2] / "docs/guides/training-does-not-learn.md").read_text()
     assert [name for name in CHECKS if f"| `{name}` |" not in page] == []
@@ -201,6 +220,29 @@ def test_resumed_run_drops_a_finding_of_iterations_after_its_checkpoint(tmp_path
     file.write_text(json.dumps({**record, "state": "running", "health": [finding]}))
     assert main(["train", "--resume", "latest", "--max-iterations", "12"]) == 0
     assert json.loads(file.read_text())["health"] == []
+
+
+@pytest.mark.parametrize(("peak", "end", "named"), [(0.5, 0.05, True), (0.5, 0.35, False), (0.2, 0.0, False)])
+def test_success_that_falls_is_named_with_both_rates(peak, end, named):
+    """Success rises until iteration 20, stays for 10 iterations and falls until iteration 40."""
+    found = findings({"Train/success_rate": lambda i: _trapezoid(i, peak, end)}, until=0.6)
+    assert ("falling-success" in found) is named
+    if named:
+        assert "has fallen from 50.0% to 5.0%" in found["falling-success"].message
+
+
+def _trapezoid(iteration, peak, end):
+    rise, fall = min(1.0, iteration / 20), min(1.0, max(0.0, (iteration - 30) / 10))
+    return peak * rise - (peak - end) * fall
+
+
+def test_exploration_that_ends_before_the_first_success_is_named():
+    plateau = {"Train/mean_reward": lambda i: 2.0 + 0.01 * (i % 3), "Policy/mean_std": lambda i: 0.6 if i < 4 else 0.09}
+    found = findings({**FAILING, **plateau}, until=0.5)["exploration"]
+    assert "has fallen from 0.6 to 0.09, the return no longer rises, and no episode succeeds" in found.message
+    assert "exploration" not in findings({**FAILING, **plateau, "Train/success_rate": lambda i: 0.02}, until=0.5)
+    rising = {"Train/mean_reward": HEALTHY["Train/mean_reward"]}
+    assert "exploration" not in findings({**FAILING, **plateau, **rising}, until=0.5)
 
 
 @pytest.mark.parametrize("until", [0.2, 0.25])

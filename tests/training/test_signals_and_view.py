@@ -95,6 +95,29 @@ def test_pipe_gets_plain_lines_and_run_on_stdout(start, only_run):
     assert "rlcli play --checkpoint" in err
 
 
+def test_time_limit_stops_with_a_checkpoint_and_resume_continues(start, only_run):
+    process = start("train", "cartpole", *LONG, "--max-iterations", 100_000, "--max-minutes", 0.05, "--json")
+    document = json.loads(process.communicate(timeout=60)[0])
+    assert (process.returncode, document["state"]) == (0, "stopped")
+    record = json.loads((only_run() / "run.json").read_text())
+    assert record["state"] == "stopped"
+    assert record["iteration"] == document["iteration"] >= 1
+    end = document["iteration"] + 1
+    process = start("train", "--resume", "latest", "--max-iterations", end, "--max-minutes", 5, "--json")
+    document = json.loads(process.communicate(timeout=60)[0])
+    assert (document["state"], document["iteration"]) == ("finished", end)
+
+
+@pytest.mark.parametrize(("at_most", "compares"), [(3.2, False), (1e-9, True)])
+def test_end_of_training_names_what_success_counts_and_a_comparison_below_the_bar(start, only_run, at_most, compares):
+    words = ["--max-iterations", 2, "episode_length_s=0.1", f"success.pole.at_most={at_most}", "success.pole.hold_s=0"]
+    _, err = start("train", "cartpole", *LONG, *words).communicate(timeout=60)
+    rate, run = ("0.0%", only_run()) if compares else ("100.0%", only_run())
+    counts = f"success {rate} counts the last episodes of the training, with exploration noise"
+    assert f"{counts}; without noise: rlcli eval --checkpoint {run}\n" in err
+    assert (f"rlcli eval --compare {run} zero\n" in err) is compares
+
+
 def test_quiet_prints_only_the_result(start, only_run):
     out, err = start("train", "cartpole", *LONG, "-q", "--max-iterations", 2).communicate(timeout=60)
     assert (out, err) == (f"{only_run()}\n", "")

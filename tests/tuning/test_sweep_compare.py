@@ -101,6 +101,7 @@ def test_compare_trains_both_arms_until_threshold(cli):
     assert done.json["ratios"]["seconds"] == pytest.approx(medians["best"]["seconds"] / medians["default"]["seconds"])
     again = cli(*words)
     assert again.code == 0
+    assert "4 trainings, each of at most " in again.err
     assert len(list(FOLDER.glob("compare-*"))) == 4, "finished trainings are not repeated"
     lines = again.out.splitlines()
     assert lines[0].split() == ["SEED", "DEFAULT", "S", "STEPS", "TRIAL", "0", "S", "STEPS"]

@@ -97,6 +97,7 @@ def test_seed_of_study_equals_single_run(cli):
     named = cli("play", "--checkpoint", study, "--viewer", "none")
     assert named.code == 5
     assert "study of several runs" in named.err
+    assert f"name one, such as {study}/seed-0 (seed-0, seed-1, seed-2); `rlcli plot {study}` draws" in named.err
     again = cli("train", "--resume", study, "--json")
     assert again.code == 0, "resuming a finished study does nothing"
     assert again.json["together"] == several.json["together"]

@@ -19,7 +19,7 @@ from rlcli.registry import find_task, folder_task
 from rlcli.rl.action_functions import zero_policy
 from rlcli.runs.run import open_run
 from rlcli.viewer.checkpoints import RunCheckpoints
-from rlcli.viewer.playback import SPEEDS, Playback, hold_command
+from rlcli.viewer.playback import SPEEDS, Playback, hold_command, run_in_real_time
 
 
 def cartpole(num_envs=3):
@@ -83,6 +83,13 @@ def test_long_gap_is_not_caught_up(counted):
     playback, steps = counted
     playback.advance(60.0)
     assert len(steps) <= 15
+
+
+def test_viewer_closes_after_its_seconds(counted):
+    playback, steps = counted
+    playback.longest_s = 0.2
+    run_in_real_time(playback, lambda: True, lambda: None)
+    assert 0 < len(steps) < 60
 
 
 def test_pause_stops_steps_and_is_playing(counted):

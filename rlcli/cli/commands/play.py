@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -33,6 +34,7 @@ def command(
     port: Annotated[int | None, typer.Option(min=0, max=65535)] = None,
     drawn: Annotated[int, typer.Option("--show", min=1)] = 1,
     commands: Annotated[list[str] | None, typer.Option("--command", metavar="NAME=X")] = None,
+    seconds: Annotated[float | None, typer.Option(min=0.0)] = None,
     stochastic: options.Stochastic = False,
     env: Annotated[int | None, typer.Option(min=0)] = None,
     episode: Annotated[int | None, typer.Option(min=0)] = None,
@@ -56,6 +58,7 @@ def command(
         drawn: Number of environments in the image, side by side at the distance scene.env_spacing.
         commands: Hold commands of the task (goals such as a velocity), as in vx=0.5,wz=0; repeatable. The error for a
             wrong name lists the valid names.
+        seconds: Length of the video at most, or time after which the window or page closes [s]. [default: no limit]
         env: With --episode: index of the environment, from 0, whose episode of an evaluation is repeated.
         episode: With --env: index of the episode in that environment, from 0.
 
@@ -75,6 +78,8 @@ def command(
     options.video_file(video, _FALLBACK_VIDEO)
     viewers = choose_viewers(viewer, port, headless=headless or to_file)
     _check_record(record, record_mode, video, held)
+    if seconds is not None and (viewer == "none" or record is not None or env is not None):
+        raise UsageError("--seconds limits a video or viewer of any episode", hint="leave out --seconds")
     if env is not None or episode is not None:
         check_choice(env, episode, num_envs, record_mode, held)
     words, usual = overrides or [], max(_VIDEO_ENVS, drawn) if video is not None and env is None else None
@@ -85,14 +90,14 @@ def command(
     file = _default_video(session) if str(video) == options.CHOOSE else video
 
     def watch() -> bool:
-        return show(session, viewers, port=port, drawn=drawn)
+        return show(session, viewers, port=port, drawn=drawn, longest_s=seconds)
 
     if env is not None and episode is not None:
         play_episode(session, env, episode, video=file, record=record, watch=watch)
         return
     _prepare(session, drawn, held)
     if file is not None:
-        _video(session, file, drawn)
+        _video(session, file, drawn, math.inf if seconds is None else seconds)
     elif record is not None or not watch():
         _statistics(session, record, record_mode)
 
@@ -130,7 +135,7 @@ def _default_video(session: Session) -> Path:
     return run.folder / "videos" / f"{checkpoint.name}.mp4"
 
 
-def _video(session: Session, file: Path, drawn: int) -> None:
+def _video(session: Session, file: Path, drawn: int, longest_s: float) -> None:
     from rlcli.cli.ui.play_episode import film
     from rlcli.evaluation.evaluate import evaluate
 
@@ -139,6 +144,7 @@ def _video(session: Session, file: Path, drawn: int) -> None:
         def end_video(step: StepResult) -> None:
             long_enough = filming.length_s >= _MIN_VIDEO_S
             filming.ended |= bool(step.truncated[0] | (step.terminated[0] & long_enough))
+            filming.ended |= filming.length_s >= longest_s
 
         summary = evaluate(session.env, filming.act, session.env.num_envs, end_video).summary()
     frames, fps, backend = filming.writer.frames, filming.writer.fps, filming.renderer.backend

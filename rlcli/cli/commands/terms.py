@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -45,6 +46,10 @@ def command(
     if not entries:
         near = did_you_mean(pattern or "", [entry.name for entry in term_entries("", term_files)])
         console.info(f"no term's name or summary contains '{pattern}'; {near or 'run `rlcli terms` to list all terms'}")
+        if task is None:
+            console.info(
+                f"a task's own terms are listed only with --task: rlcli terms {quote(pattern or '')} --task TASK"
+            )
     console.document("terms", terms=[entry.document() for entry in exact or entries])
 
 

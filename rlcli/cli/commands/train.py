@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -23,6 +24,9 @@ if TYPE_CHECKING:
     from rlcli.training.signals import StopRequest
     from rlcli.training.start_run import TrainingRequest
 
+_GOOD = 0.95
+"""Success rate below which the end of a training suggests a comparison with zero actions."""
+
 
 def command(
     task: options.OptionalTask = None,
@@ -34,6 +38,7 @@ def command(
     num_envs: options.NumEnvs = None,
     max_iterations: options.MaxIterations = None,
     max_steps: options.MaxSteps = None,
+    max_minutes: options.MaxMinutes = None,
     until: Annotated[str | None, typer.Option(metavar="KEY=X")] = None,
     device: options.Device = "auto",
     gpus: Annotated[int | None, typer.Option(min=1)] = None,
@@ -82,7 +87,9 @@ def command(
     console.muted = not distributed.is_rank_zero()
     request = TrainingRequest(runs_dir or default_runs_dir(), None, resume, agent, device, gpus, config)
     request.overrides, request.flags = overrides or [], flags(scene__num_envs=num_envs)
-    request.budget = options.budget_keys(max_iterations, max_steps) | ({} if until is None else {"agent.until": until})
+    ends = {"agent.until": until, "agent.max_minutes": max_minutes}
+    request.budget = options.budget_keys(max_iterations, max_steps)
+    request.budget |= {key: value for key, value in ends.items() if value is not None}
     request.seed = options.random_if_minus_one(42 if seed is None else seed)
     request.loggers, request.init_from, request.video_every, request.name = logger, init_from, video_every, name
     study = _study(request, seeds, jobs, seed)
@@ -159,7 +166,7 @@ def _source(task: str | None, request: TrainingRequest, seed: int | None, seeds:
     if changes:
         raise UsageError(
             f"a resumed run keeps its configuration: {', '.join(changes)} cannot be given with --resume"
-            " (--max-iterations and --max-steps can)",
+            " (--max-iterations, --max-steps, --max-minutes and --until can)",
             hint="to change them, start a new run with the old run's weights: --init-from RUN",
         )
     return source
@@ -199,16 +206,32 @@ def _print(result: TrainingResult) -> None:
             f"trained {result.new_steps:,} steps in {result.elapsed_s:.1f} s{total};"
             f" next: rlcli play --checkpoint {result.run}"
         )
+    for line in _next_steps(result):
+        console.info(line)
     console.data(str(result.run))
     training = {"iteration": result.iteration, "elapsed_s": result.elapsed_s, "seed": result.seed}
     console.document(
         "train",
         run=str(result.run),
-        state="finished",
+        state=result.state,
         checkpoint=str(result.checkpoint),
         step=result.step,
         **{name: value for name, value in training.items() if value is not None},
     )
+
+
+def _next_steps(result: TrainingResult) -> list[str]:
+    """Return what the last success rate or return of the training counts, and how to find out whether it is good."""
+    success, mean_return = (result.metrics.get(f"Train/{name}") for name in ("success_rate", "mean_reward"))
+    if mean_return is None:
+        return []
+    figure = f"return {mean_return:.4g}" if success is None else f"success {success:.1%}"
+    run = shlex.quote(str(result.run))
+    counts = "counts the last episodes of the training, with exploration noise"
+    lines = [f"{figure} {counts}; without noise: rlcli eval --checkpoint {run}"]
+    if success is None or success < _GOOD:
+        lines.append(f"compare it with a policy of zero actions: rlcli eval --compare {run} zero")
+    return lines
 
 
 def _train_seeds(

@@ -101,7 +101,9 @@ def choose_viewers(viewer: str | None, port: int | None, *, headless: bool) -> l
     return [("native", "there is a display"), *fallbacks] if has_display() else fallbacks
 
 
-def show(session: Session, viewers: Sequence[Choice], *, port: int | None, drawn: int) -> bool:
+def show(
+    session: Session, viewers: Sequence[Choice], *, port: int | None, drawn: int, longest_s: float | None = None
+) -> bool:
     """Open the first viewer that works and wait until it is closed.
 
     Args:
@@ -109,6 +111,7 @@ def show(session: Session, viewers: Sequence[Choice], *, port: int | None, drawn
         viewers: the viewers to try, in this order.
         port: port of the web viewer; None: 8080.
         drawn: number of environments to show.
+        longest_s: time after which the viewer closes [s]; None: no limit.
 
     Returns:
         Whether a viewer was opened; False for the viewer none, for which the caller prints values.
@@ -122,7 +125,7 @@ def show(session: Session, viewers: Sequence[Choice], *, port: int | None, drawn
             return False
         try:
             with track("viewer", has_own_view=True):
-                _open(session, name, reason, port, drawn)
+                _open(session, name, reason, port, drawn, longest_s)
         except (MachineError, DependencyError) as error:
             if position + 1 == len(viewers):
                 raise
@@ -132,11 +135,12 @@ def show(session: Session, viewers: Sequence[Choice], *, port: int | None, drawn
     raise AssertionError("bug in rlcli: there is no viewer to try")
 
 
-def _open(session: Session, name: str, reason: str, port: int | None, drawn: int) -> None:
+def _open(session: Session, name: str, reason: str, port: int | None, drawn: int, longest_s: float | None) -> None:
     """Show the policy in the viewer `name` until it is closed, then print the JSON document."""
     module, _, function = VIEWERS[name].partition(":")
     run: Viewer = getattr(importlib.import_module(module), function)
     playback, address = _playback(session), None
+    playback.longest_s = longest_s
 
     def ready(instructions: Sequence[str], url: str | None) -> None:
         nonlocal address

@@ -47,6 +47,7 @@ _AGENT = "Agent of the task: a trainer and its settings. [default: the task's]"
 _CONFIG = "YAML file merged over the task; its key `agent` changes the chosen agent."
 _FEW_ENVS = "Number of environments, whatever scene.num_envs is; at least 8."
 _SEED = "Seed of all random numbers; -1 picks a random one and records it."
+_MAX_MINUTES = "Minutes after which each training stops with a checkpoint; --resume continues it. [default: no limit]"
 _TASK_FOLDER = "Folder of the task's code, if the task is not installed and its folder has moved."
 _RUNS_DIR = "Folder of runs. [default: RLCLI_RUNS_DIR, the settings' runs_dir, or runs]"
 _RECORD_MODE = "Episodes to record: all, succeeded, failed, or separate (one file each for the last two)."
@@ -68,6 +69,7 @@ Device = Annotated[str, choice("DEVICE", "auto", "cpu", "cuda", help=_DEVICE)]
 RunName = Annotated[str | None, typer.Option(help="Text at the end of the run folder's name.")]
 MaxIterations = Annotated[int | None, typer.Option(help="Iterations of each training. [default: the agent's]")]
 MaxSteps = Annotated[int | None, typer.Option(help="Environment steps of each training. [default: the agent's]")]
+MaxMinutes = Annotated[float | None, typer.Option(help=_MAX_MINUTES)]
 TaskFolder = Annotated[str | None, typer.Option(metavar="FOLDER", help=_TASK_FOLDER)]
 RunsDir = Annotated[Path | None, typer.Option(help=_RUNS_DIR)]
 Record = Annotated[Path | None, typer.Option(metavar="FILE", help="Record the episodes to FILE, for rlcli replay.")]

@@ -153,7 +153,7 @@ class FilmedPolicy:
     @property
     def length_s(self) -> float:
         """Simulated time of the frames so far [s]."""
-        return self.writer.frames * self.stride * self.session.env.step_dt
+        return self.writer.frames / self.writer.fps
 
     def act(self, obs: Tensor) -> Tensor:
         """Render the state if a frame is due; return the action. obs: (num_envs, obs_size)"""

@@ -308,7 +308,7 @@ class SuccessConfig(TermConfig):
     """Smallest value of the term with which the condition holds."""
 
     hold_s: Annotated[NotNegative, _Limits(0.0, 1e9)] = 1.0
-    """How long the condition must hold before the time-out [s]."""
+    """How long the condition must hold before the time-out [s]; 0: in the last step."""
 
 
 def bound_text(condition: Mapping[str, Any]) -> str:

@@ -304,6 +304,13 @@ def test_video_continues_after_early_termination(cli):
 
 
 @pytest.mark.slow
+def test_video_ends_after_its_seconds(cli):
+    play = ("play", "cartpole", "--policy", "zero", "--json", "viewer.width=160", "viewer.height=120", "--num-envs", 1)
+    assert cli(*play, "--video", "x.gif", "--seconds", 0.5).json["frames"] == 10
+    assert cli("play", "cartpole", "--policy", "zero", "--viewer", "none", "--seconds", 1).code == 2
+
+
+@pytest.mark.slow
 def test_gif_plays_in_real_time(cli, trained):
     result = cli("play", "cartpole", "--video", "x.gif", "--num-envs", 1, "--json").json
     assert result["fps"] == pytest.approx(20)

@@ -40,4 +40,6 @@ def test_terms_json_has_every_key(cli):
 def test_terms_suggests_near_names(cli):
     done = cli("terms", "joint_vel_l11")
     assert done.code == 0
-    assert "joint_vel_l1" in done.err
+    assert "did you mean 'joint_vel_l1'" in done.err
+    assert "only with --task: rlcli terms joint_vel_l11 --task TASK" in done.err
+    assert "--task" not in cli("terms", "joint_vel_l11", "--task", "cartpole").err

@@ -54,7 +54,7 @@ def test_metrics_have_rsl_rl_names_and_one_row_per_iteration(cli, only_run):
     wanted = {
         "Train/mean_reward", "Train/mean_episode_length", "Episode_Reward/alive", "Episode_Termination/time_out",
         "Loss/value", "Loss/surrogate", "Loss/learning_rate", "Policy/mean_std", "Perf/total_fps",
-        "Perf/collection_time", "Perf/learning_time",
+        "Perf/collection_time", "Perf/learning_time", "Perf/iteration_time",
     }  # fmt: skip
     assert wanted <= set(rows[-1])
     assert any(only_run().glob("tb/events.out.tfevents.*"))

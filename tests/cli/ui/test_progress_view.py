@@ -1,5 +1,6 @@
 """Progress of long commands: the text of a line, lines in a pipe, and silence with --quiet."""
 
+import re
 import subprocess
 import sys
 import time
@@ -51,6 +52,15 @@ def test_time_left_counts_down_and_disappears_when_a_part_takes_longer():
     assert work_line([work]) == "checks 15/20, 75%, 0:30 so far"
     work.advance()
     assert work.changed >= now
+
+
+@pytest.mark.slow
+def test_sweep_shows_how_many_trials_have_ended(tmp_path):
+    short = ["scene.num_envs=16", "agent.torch_threads=1", "--trials", "2", "--max-iterations", "1", "--episodes", "4"]
+    command = ["sweep", "cartpole", "--param", "agent.learning_rate=log:1e-4:1e-2", *short]
+    done = subprocess.run([sys.executable, "-c", SHORT_WAITS, *command], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert re.search("^rlcli sweep: trials 1/2, 50%, ", done.stderr, re.MULTILINE), done.stderr
 
 
 def test_work_ends_with_its_context():

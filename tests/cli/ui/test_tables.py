@@ -100,15 +100,19 @@ def test_live_table_keeps_numbers_with_their_units(width):
     view = TrainingView("rlcli train cartpole")
     screen = Console(file=io.StringIO(), width=width)
     view._live = Live(console=screen)
-    screen.print(view._table(progress_from_metrics([row], 240, 12.0)))
+    screen.print(view._table(progress_from_metrics([row], 240)))
     output = screen.file.getvalue()
     for whole in ("rlcli train cartpole", "iteration 80/240", "655,360 steps", "54,613 steps/s", "0:24 left"):
         assert whole in output
 
 
-def test_remaining_time_includes_time_between_iterations():
-    """Videos, evaluations and checkpoints take time that is not part of any iteration."""
-    row = {"iteration": 50, "step": 5000, "Perf/collection_time": 0.1, "Perf/learning_time": 0.1}
-    assert progress_from_metrics([row], 100, 10.0).remaining_s == pytest.approx(10.0)
-    assert progress_from_metrics([row], 100, 30.0).remaining_s == pytest.approx(30.0)
-    assert progress_from_metrics([row], 100, 0.0).remaining_s == pytest.approx(10.0)  # the trained time is unknown
+def test_remaining_time_is_that_of_recent_iterations():
+    """The first iteration compiles; videos, evaluations and checkpoints take time beside rollout and update."""
+    parts = {"Perf/collection_time": 0.1, "Perf/learning_time": 0.1}
+    rows = [{"iteration": n, "step": 100 * n, **parts} for n in (1, 2, 3)]
+    assert progress_from_metrics(rows, 103).remaining_s == pytest.approx(20.0)
+    for row, duration in zip(rows, (30.0, 0.3, 0.5), strict=True):
+        row["Perf/iteration_time"] = duration
+    progress = progress_from_metrics(rows, 103)
+    assert (progress.remaining_s, progress.steps_per_s) == (pytest.approx(40.0), pytest.approx(250.0))
+    assert progress_from_metrics(rows[:1], 103).remaining_s == pytest.approx(102 * 30.0)
