@@ -17,6 +17,7 @@ from rlcli.envs.make import make_env
 from rlcli.errors import ConfigError, TaskError
 from rlcli.registry import find_task
 from rlcli.scene.names import NameProblem
+from rlcli_isaaclab import namespace
 
 torch.set_num_threads(1)
 ROBOT = "    robot = ArticulationCfg("
@@ -569,15 +570,15 @@ def test_name_that_the_installed_rsl_rl_lacks_raises_when_it_is_used(tmp_path):
         stepped(resolved)
 
 
-def test_own_rsl_rl_of_a_repository_is_imported(tmp_path, monkeypatch):
-    for name in [name for name in sys.modules if name.partition(".")[0] == "rsl_rl"]:
-        monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setattr(sys, "path", [entry for entry in sys.path if not entry.endswith("site-packages")])
-    own = tmp_path / "rsl_rl" / "rsl_rl"
+def test_library_of_agents_in_a_repository_is_not_replaced(tmp_path):
+    own = tmp_path / "rsl_rl_of_test" / "rsl_rl_of_test"
     own.mkdir(parents=True)
-    (own / "__init__.py").write_text("")
-    (own / "of_test.py").write_text("from isaaclab.utils import configclass\n\nNUMBER = 3\n")
-    rover(tmp_path / "tasks", "from rsl_rl.of_test import NUMBER\nassert NUMBER == 3\n")
+    (own / "__init__.py").write_text("NUMBER = 3\n")
+    file = str(tmp_path / "tasks" / "rover_env.py")
+    assert namespace._trainer_module("rsl_rl_of_test", file) is None
+    assert sys.modules["rsl_rl_of_test"].NUMBER == 3
+    absent = namespace._trainer_module("other_rl_of_test.modules", file)
+    assert absent.ActorCritic.__name__ == "ActorCritic"
 
 
 def test_message_has_the_name_that_a_package_has_in_its_files(tmp_path):
