@@ -141,7 +141,8 @@ def open_mjcf(checked: CheckedModel, *, compiled: bool = False) -> mujoco.MjSpec
     except MUJOCO_ERRORS as error:
         if too_little := memory_error(error):
             raise too_little from None
-        raise BadModel(f"{checked.scan.file_of(str(error))}: {one_line(error)}") from None
+        message = one_line(error).replace(", line 0", "")  # MuJoCo's line of elements of included files
+        raise BadModel(f"{checked.scan.file_of(str(error))}: {message}") from None
     _check_options(spec, file)
     return spec
 

@@ -293,6 +293,7 @@ def test_bad_model_is_refused_by_name_before_it_is_opened(name, task):
     assert time.process_time() - begin < 10
     assert "model" in str(caught.value)
     assert reason in str(caught.value)
+    assert ", line 0" not in str(caught.value)
     assert "task.yaml:6:" in str(caught.value)
 
 

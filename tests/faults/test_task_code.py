@@ -164,6 +164,7 @@ ERRORS = {
     "exec('raise BrokenPipeError(32, str(32))')": "BrokenPipeError: [Errno 32] 32",
     "exec('raise EOFError(7)')": "EOFError: 7",
     "next(iter([]))": "StopIteration",
+    "os._exit(7)": "SystemExit: it called os._exit(7)",
     "exec('import typer; raise typer.Exit(0)')": "Exit: 0",
     "exec('import typer; raise typer.Abort')": "Abort",
 }

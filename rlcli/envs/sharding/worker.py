@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 from rlcli.envs.sharding.channel import SPIN_S, Channel, ChannelClosedError
 from rlcli.errors import RlcliError, TaskError
 from rlcli.machine.memory import memory_error
-from rlcli.registry.task_code_monitor import error_of_task, observe_task_code, restore_built_in
+from rlcli.registry.task_code_monitor import error_of_task, exit_refused, observe_task_code, restore_built_in
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -72,7 +72,7 @@ def main(connection: int, arrays: int) -> None:
     logging.getLogger("rlcli").addHandler(_WarningSender(channel))
     with contextlib.suppress(BaseException):
         try:
-            with observe_task_code():
+            with observe_task_code(), exit_refused():
                 _serve(channel, arrays)
         except ChannelClosedError:
             raise

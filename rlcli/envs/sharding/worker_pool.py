@@ -134,7 +134,7 @@ class Worker:
         how = "closed its connection" if code is None else f"ended with exit code {code}"
         if code is not None and code < 0:
             how = f"was ended by {signal.Signals(-code).name}"
-        hint = "if memory is full, lower scene.num_envs or scene.workers; then resume the run"
+        hint = "if memory is full, lower scene.num_envs or scene.workers"
         return MachineError(
             f"worker process {self.number} of the environment (pid {self._process.pid}) {how}", hint=hint
         )
