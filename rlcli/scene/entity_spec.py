@@ -85,20 +85,6 @@ def entity_spec(
         raise _not_valid(("scene", "entities", name, "model"), entity.model, error) from None
 
 
-def name_all(child: mujoco.MjSpec) -> None:
-    """Give a name to every element of a model that has none: in the scene, entities find their elements by name."""
-    for kind in ("body", "joint", "site", "sensor", "actuator", "geom", "tendon", "pair"):
-        elements = child.bodies[1:] if kind == "body" else getattr(child, f"{kind}s")  # the first body is the world
-        used = {element.name for element in elements}
-        for number, element in enumerate(elements):
-            if not element.name:
-                new_name = element.target if kind == "actuator" and element.target not in used else f"{kind}_{number}"
-                while new_name in used:
-                    new_name += "_"
-                element.name = new_name
-                used.add(new_name)
-
-
 def frame_of_start_pose(child: mujoco.MjSpec, entity: EntityConfig) -> tuple[FloatArray, FloatArray]:
     """Return position and quaternion of the frame to which a model is attached, so that its root has its start pose."""
     pos, quat = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])

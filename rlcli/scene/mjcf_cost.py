@@ -9,6 +9,27 @@ from dataclasses import dataclass, field, replace
 ENDLESS = 1e18
 """Upper bound of counts of copies and of costs, so that products of a few of them stay finite."""
 
+REFERENCES = {
+    *(
+        "actuator",
+        "tendon",
+        "tendon1",
+        "tendon2",
+        "objname",
+        "refname",
+        "body",
+        "body1",
+        "body2",
+        "subtree1",
+        "subtree2",
+    ),
+    *("joint", "joint1", "joint2", "jointinparent", "geom", "geom1", "geom2", "site", "site1", "site2", "sidesite"),
+    *("cranksite", "slidersite", "refsite"),
+}
+"""Attributes by which sensors, actuators, tendons, equality constraints, pairs, tuples and skins name elements."""
+_CHAIN = 4
+"""Longest chain of references: a tuple that refers to a sensor of the actuator of a tendon."""
+
 
 @dataclass(frozen=True, slots=True)
 class ModelCost:
@@ -20,6 +41,8 @@ class ModelCost:
     """Cost of the models that MuJoCo reads to attach them, each before it is copied."""
     elements: float = 0.0
     """Number of elements."""
+    referring: float = 0.0
+    """Number of elements such as sensors and actuators, which refer to others."""
     stored: dict[str, float] = field(default_factory=dict)
     """Name -> size of the arrays of user numbers that MuJoCo stores with every element, such as `nuser_geom`."""
     keys: float = 0.0
@@ -40,6 +63,7 @@ class ModelCost:
             min(self.size + other.size, ENDLESS),
             min(self.loads + other.loads, ENDLESS),
             min(self.elements + other.elements, ENDLESS),
+            min(self.referring + other.referring, ENDLESS),
             {name: max(self.stored.get(name, 0.0), other.stored.get(name, 0.0)) for name in names},
             min(self.keys + other.keys, ENDLESS),
             min(self.assets + other.assets, ENDLESS),
@@ -57,8 +81,54 @@ class ModelCost:
             with_loads: whether the result has `loads`, which does not grow with the copies; False if the caller has
                 counted it already.
         """
-        scaled = {name: min(getattr(self, name) * copies, ENDLESS) for name in ("size", "elements", "keys", "assets")}
+        grows = ("size", "elements", "referring", "keys", "assets")
+        scaled = {name: min(getattr(self, name) * copies, ENDLESS) for name in grows}
         return replace(self, loads=self.loads if with_loads else 0.0, **scaled)
+
+
+@dataclass(slots=True)
+class References:
+    """References between the elements of a model by name, such as those of sensors, actuators and tendons.
+
+    MuJoCo copies an element with each replica of an element that it refers to.
+    """
+
+    _copies: dict[str, float] = field(default_factory=dict)
+    """Name of an element -> its number of replicas."""
+    _used: list[tuple[str, tuple[str, ...]]] = field(default_factory=list)
+    """Name of each referring element (or of its tendon, tuple or skin), and the names that it uses."""
+
+    def add(self, owner: str, attributes: dict[str, str], copies: float) -> None:
+        """Add an element.
+
+        Args:
+            owner: the name of the innermost open element that has one: of a tendon, for its joints.
+            attributes: attributes of the element.
+            copies: how often `replicate` copies it.
+        """
+        if name := attributes.get("name"):
+            self._copies[name] = max(self._copies.get(name, 1.0), copies)
+        used = tuple(word for key in REFERENCES & attributes.keys() for word in attributes[key].split())
+        if used:
+            self._used.append((owner, used))
+
+    def extend(self, other: References, copies: float) -> None:
+        """Add the elements of an included file, which is copied as often as given."""
+        for name, count in other._copies.items():
+            self._copies[name] = max(self._copies.get(name, 1.0), min(count * copies, ENDLESS))
+        self._used += other._used
+
+    def count(self) -> float:
+        """Return the number of referring elements after all elements are replicated."""
+        copies = dict(self._copies)
+        total = 0.0
+        for _ in range(_CHAIN):
+            total = 0.0
+            for name, used in self._used:
+                count = max(copies.get(word, 1.0) for word in used)
+                copies[name] = max(copies.get(name, 1.0), count)
+                total += count
+        return min(total, ENDLESS)
 
 
 def stored_arrays(name: str, attributes: dict[str, str]) -> Iterator[tuple[str, float]]:

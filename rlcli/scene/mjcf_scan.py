@@ -6,14 +6,23 @@ import itertools
 import math
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 from xml.parsers import expat
 
 from rlcli.machine.plain_files import read_plain
 from rlcli.safe_text import shorten
-from rlcli.scene.mjcf_cost import ENDLESS, ModelCost, element_cost, mjcf_number, number_of, stored_arrays
+from rlcli.scene.mjcf_cost import (
+    ENDLESS,
+    REFERENCES,
+    ModelCost,
+    References,
+    element_cost,
+    mjcf_number,
+    number_of,
+    stored_arrays,
+)
 
 MAX_COST = 1_000_000
 """Cost above which a model or a scene is refused; unit: one element."""
@@ -32,6 +41,8 @@ _MAX_ATTRIBUTES = 200
 """Largest number of attributes of an element: MuJoCo compares each attribute with all others. MJCF has up to 60."""
 _MAX_LOOKUPS = 50_000
 """Largest product of the number of assets and the number of folders in which MuJoCo may look for them."""
+_LOOKUP_COST = 0.2
+"""Cost of one element that refers to others, for each replica of any element: MuJoCo looks at it again."""
 _TEXT = (".xml", ".mjcf", ".urdf")
 _LARGEST_NUMBER = 1e30
 """Largest absolute value of a number in MJCF, except in ranges: products of a few larger numbers are infinite."""
@@ -39,11 +50,9 @@ _NOT_NEGATIVE = ("armature", "frictionloss")
 """Attributes of joints and tendons whose negative values are refused here; MuJoCo accepts them."""
 _PERHAPS_WRONG = re.compile(r"[-+]?(nan|inf)|[eE]\+?\d{2}|\d{30}", re.IGNORECASE)
 """Parts of numbers that may be too large or not finite: nan, inf, an exponent of two digits, thirty digits."""
-_NAMES = {
+_NAMES = REFERENCES | {
     *("name", "class", "childclass", "prefix", "model", "frame", "target", "instance", "plugin", "key", "material"),
-    *("mesh", "hfield", "texture", "camera", "actuator", "tendon", "tendon1", "tendon2", "flex", "node", "objname"),
-    *("refname", "body", "body1", "body2", "subtree1", "subtree2", "joint", "joint1", "joint2", "jointinparent"),
-    *("geom", "geom1", "geom2", "site", "site1", "site2", "sidesite", "cranksite", "slidersite", "refsite"),
+    *("mesh", "hfield", "texture", "camera", "flex", "node"),
 }
 """Attributes that contain names, which may look like numbers, as `inf` does."""
 _FREE_SENSORS = ("clock", "e_potential", "e_kinetic", "user", "plugin")
@@ -71,6 +80,8 @@ class _Text:
     """Sum of the counts of the elements `replicate`."""
     free_sensors: int = 0
     """Number of sensors without an object, which MuJoCo doubles with every replica."""
+    references: References = field(default_factory=References)
+    """References between elements by name."""
     includes: list[tuple[float, Path]] = field(default_factory=list)
     """(number of copies, file) of each `include`."""
     models: list[tuple[int, str, Path]] = field(default_factory=list)
@@ -167,21 +178,27 @@ class MjcfScan:
                     message = f"{source}:{line}: the model attaches itself: {cycle}"
                     raise BadModel(f"{message}; remove one of these attachments")
                 models[name] = models.get(name, ModelCost()).beside(self._model_cost(other, (*parents, file)))
-        replicas = min(sum(text.replicas for _, _, text in parts), 50.0)
-        sensors = sum(text.free_sensors for _, _, text in parts) * 2.0**replicas
+        replicas = sum(text.replicas for _, _, text in parts)
+        sensors = sum(text.free_sensors for _, _, text in parts) * 2.0 ** min(replicas, 50.0)
         self._note_cost(sensors, f"sensors without an object in {file}, which every replica of `replicate` doubles")
-        cost = ModelCost(size=sensors)
+        references = References()
+        for _, copies, text in parts:
+            references.extend(text.references, copies)
+        cost = ModelCost(size=sensors, referring=references.count())
         any_model = ModelCost()
         for model in models.values():
             cost = cost.loading(model)
             any_model = any_model.beside(model)
         for _, copies, text in parts:
-            own = ModelCost(text.cost, 0.0, text.elements, text.stored, text.keys, text.assets)
+            own = ModelCost(text.cost, 0.0, text.elements, 0.0, text.stored, text.keys, text.assets)
             cost = cost.beside(own.times(copies))
             for name, count in text.attached.items():
                 attached = models.get(name, any_model).times(copies * count, with_loads=False)
                 self._note_cost(attached.size + attached.assets, f"attach of model '{name}' in {file}")
                 cost = cost.beside(attached)
+        lookups = min(replicas * cost.referring * _LOOKUP_COST, ENDLESS)
+        self._note_cost(lookups, f"{cost.referring:,.0f} sensors, actuators and the like in {file}, with `replicate`")
+        cost = replace(cost, loads=min(cost.loads + lookups, ENDLESS))
         self._costs[file] = cost
         return cost
 
@@ -220,6 +237,8 @@ class MjcfScan:
         files: list[tuple[int, str, str, str, float]] = []
         copies: list[float] = [1.0]
         """How often each open element is replicated."""
+        names: list[str] = [""]
+        """Name of each open element, or of the element around it."""
         parser = expat.ParserCreate("utf-8")
 
         def start(name: str, attributes: dict[str, str]) -> None:
@@ -250,6 +269,8 @@ class MjcfScan:
             if name == "attach":
                 model = attributes.get("model", "")
                 text.attached[model] = text.attached.get(model, 0.0) + copies[-1]
+            names.append(attributes.get("name") or names[-1])
+            text.references.add(names[-1], attributes, copies[-1])
             copies.append(min(copies[-1] * count, ENDLESS))
             text.replicas += count if name == "replicate" else 0.0
             text.free_sensors += name in _FREE_SENSORS and "objname" not in attributes
@@ -274,7 +295,7 @@ class MjcfScan:
             raise BadModel(f"{file}:{parser.CurrentLineNumber}: a DOCTYPE is not allowed; remove it")
 
         parser.StartElementHandler = start
-        parser.EndElementHandler = lambda name: copies.pop()
+        parser.EndElementHandler = lambda name: (copies.pop(), names.pop())
         parser.StartDoctypeDeclHandler = refuse
         try:
             parser.Parse(data, True)

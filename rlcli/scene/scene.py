@@ -13,9 +13,10 @@ from rlcli.config.schema import EntityConfig, SceneConfig, SimConfig, TerrainCon
 from rlcli.errors import ConfigError, Problem, one_line
 from rlcli.machine.memory import memory_error
 from rlcli.scene.avoid_sparse_newton import avoid_sparse_newton
-from rlcli.scene.entity_spec import checked_models, entity_spec, frame_of_start_pose, name_all, write_masses
+from rlcli.scene.entity_spec import checked_models, entity_spec, frame_of_start_pose, write_masses
 from rlcli.scene.ground_and_lights import add_ground_plane, add_lights, add_materials
 from rlcli.scene.joint_and_actuator_setup import SceneJoints
+from rlcli.scene.name_elements import name_all
 from rlcli.scene.names import SceneProblem
 from rlcli.scene.sensor_builder import SensorBuilder, SensorSpec
 from rlcli.scene.terrain import Ground, add_ground, make_ground, terrain_problems

@@ -229,6 +229,7 @@ _SUBPROCESS_CODE = """
 import json, sys
 memory, time, files = int(sys.argv[1]), int(sys.argv[2]), json.load(sys.stdin)
 import mujoco
+from rlcli.scene.name_elements import name_all
 log = mujoco.MjLogConfig()
 log.logto_file = log.logto_console = False
 log.set()
@@ -245,6 +246,7 @@ scene.copy_during_attach = True
 try:
     for number, file in enumerate(files):
         child = mujoco.MjSpec.from_file(file)
+        name_all(child)  # as the scene does: for many elements it takes as long as reading the file
         if len(files) == 1:
             scene = child
         else:

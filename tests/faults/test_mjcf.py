@@ -196,6 +196,20 @@ NAMED = {
         ),
         "sensors without an object",
     ),
+    "a sensor of every copy": (
+        model(body='<replicate count="2300"><site name="s"/></replicate>').replace(
+            "</mujoco>", '<sensor><rangefinder site="s"/></sensor></mujoco>'
+        ),
+        "2,300 sensors, actuators and the like",
+    ),
+    "a sensor of the actuator of the tendon of every copy": (
+        model(body='<replicate count="1500"><body><joint name="j"/><geom size="1"/></body></replicate>').replace(
+            "</mujoco>",
+            '<tendon><fixed name="t"><joint joint="j" coef="1"/></fixed></tendon><actuator><motor name="a" tendon="t"/>'
+            '</actuator><sensor><actuatorpos actuator="a"/></sensor></mujoco>',
+        ),
+        "4,500 sensors, actuators and the like",
+    ),
     "a sensor of 900 million numbers": (
         model().replace("</mujoco>", '<sensor><user dim="900000000"/></sensor></mujoco>'),
         "the model is too large: its cost is",
@@ -342,6 +356,31 @@ def test_large_model_is_first_compiled_under_limits(tmp_path, monkeypatch):
     with pytest.raises(BadModel, match=r"model\.xml: compiling takes more than"):
         read_mjcf(file, [tmp_path])
     assert os.times().children_user - begin.children_user < 5
+
+
+def test_references_to_copies_cost_copies_times_references(tmp_path):
+    """A scanner of 360 rays on a robot with 40 motors: MuJoCo looks 360 times at 400 elements."""
+    file = tmp_path / "model.xml"
+    rays = model(body='<body name="scanner"><replicate count="360"><site name="ray"/></replicate></body>')
+    parts = '<actuator><motor joint="slide"/></actuator>' * 40 + '<sensor><rangefinder site="ray"/></sensor>'
+    file.write_text(rays)
+    without = check_mjcf(file, [tmp_path]).cost.total
+    file.write_text(rays.replace("</mujoco>", parts + "</mujoco>"))
+    cost = check_mjcf(file, [tmp_path]).cost
+    assert cost.referring == 400
+    assert 360 * 400 / 10 < cost.total - without < 360 * 400 / 3
+
+
+def test_elements_are_named_under_limits(tmp_path, monkeypatch):
+    """MuJoCo compares each new name with all others, which takes as long as reading a file with many joints."""
+    file, log = tmp_path / "model.xml", tmp_path / "log"
+    file.write_text(model())
+    note = f"open({str(log)!r}, 'w').write(repr([geom.name for geom in scene.geoms]))"
+    code = untrusted_mjcf._SUBPROCESS_CODE.replace("    scene.compile()", f"    {note}\n    scene.compile()")
+    monkeypatch.setattr(untrusted_mjcf, "SUBPROCESS_COST", 0)
+    monkeypatch.setattr(untrusted_mjcf, "_SUBPROCESS_CODE", code)
+    read_mjcf(file, [tmp_path])
+    assert log.read_text() == "['geom_0']"
 
 
 def test_system_without_limits_reads_models(tmp_path, monkeypatch):

@@ -366,7 +366,7 @@ class SceneReader:
         import mujoco
 
         from rlcli.registry import model_file
-        from rlcli.scene.entity_spec import name_all
+        from rlcli.scene.name_elements import name_all
         from rlcli.scene.untrusted_mjcf import model_roots, read_mjcf
 
         try:
