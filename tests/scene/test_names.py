@@ -35,8 +35,8 @@ def test_pattern_matches_names_in_full(pattern, found):
         ("h?" * 60 + "h" * 60 + "x", "has 60 of the quantifiers"),
         ("h" * 1001, "1,001 characters"),
         ("h{99999999999999999999}", "repetition number is too large"),
-        ("[[h]ip", "neither a joint nor a regular expression"),
-        ("(h", "neither a joint nor a regular expression"),
+        ("[[h]ip", "neither the name of a joint nor a regular expression"),
+        ("(h", "neither the name of a joint nor a regular expression"),
         ("left", "no joint matches"),
     ],
 )

@@ -317,7 +317,7 @@ def test_entity_without_bodies_is_fixed(tmp_path):
         ({"model": "broken.xml"}, r"scene.entities.robot.model: 'broken.xml' is not a valid MJCF: .*bdoy"),
         ({"joints": {"elbo": {"damping": 1.0}}}, r"robot.joints.elbo: no joint matches 'elbo'; did you mean 'elbow'"),
         ({"joints": {"wrist": {"damping": 1.0}}}, r"no joint matches 'wrist'.*joints: shoulder, elbow"),
-        ({"joints": {"(": {"damping": 1.0}}}, r"neither a joint nor a regular expression"),
+        ({"joints": {"(": {"damping": 1.0}}}, r"neither the name of a joint nor a regular expression"),
         ({"init": {"joint_pos": {"knee": 1.0}}}, r"scene.entities.robot.init: no joint matches 'knee'"),
     ],
 )  # fmt: skip

@@ -226,7 +226,7 @@ def test_validate_deep_reports_all_problems_at_once(in_process, small):
     assert "no joint matches 'sldier' | did you mean 'slider'?" in problems["actions.push.joints"]
     assert "no joint matches 'leg_.*' | joints: slider, hinge" in problems["observations.policy.pos.joints"]
     assert "joint 'hinge' is matched twice" in problems["rewards.twice.joints"]
-    assert "neither a joint nor a regular expression" in problems["rewards.regex.joints"]
+    assert "neither the name of a joint nor a regular expression" in problems["rewards.regex.joints"]
     assert "no entity 'robto' in the scene | did you mean 'robot'?" in problems["rewards.who.entity"]
     assert "no joint matches 'nope'" in problems["scene.entities.robot.joints.nope"]
     assert "no joint matches 'knee'" in problems["scene.entities.robot.init"]
