@@ -71,8 +71,10 @@ def build_simulation(scene: Scene, binder: Binder, device: torch.device, seed: i
     try:
         model = scene.compile(on_cpu=device.type == "cpu")
     except ConfigError:
+        found, binder.problems = binder.problems, []  # the cause comes first: without its model a robot has no joints
         for problem in scene.broken_models():
             binder.add_problem(problem.path, str(problem), problem.hint)
+        binder.problems += found
         binder.raise_problems()
         raise
     engine = open_engine(model, task.scene.num_envs, task.sim, device=str(device))

@@ -248,17 +248,23 @@ def _resolve(name: str, scope: Mapping[str, Any]) -> tuple[Any, Any]:
     """
     first, _, rest = name.partition(".")
     own = str(scope.get("__name__", "")).partition(".")[0]
-    in_tree = OWN_NAMES.get(own) == first and own != first
+    in_tree = OWN_NAMES.get(own) == first and own != first and _has_member(sys.modules[own], rest.partition(".")[0])
     file = str(scope.get("__file__", ""))
     for form in _formats_for(first, file):
         module = _alias_module(form, name, file, below_top=in_tree)
         if module is not None:
-            return module, _alias_module(form, first, file) or _above_alias(form, name, file)
+            return module, _top_of(form, name, file)
     if in_tree:
         return importlib.import_module(f"{own}.{rest}" if rest else own), sys.modules[own]
     if first not in sys.modules:
         import_package(first, rest, Path(file))
     return None, None
+
+
+def _has_member(package: ModuleType, name: str) -> bool:
+    """Return whether a package of a task has a module; the package may have the name of a package of a framework."""
+    folders = [Path(place) for place in getattr(package, "__path__", ())]
+    return not name or any((place / name).is_dir() or (place / f"{name}.py").is_file() for place in folders)
 
 
 def import_package(name: str, inner: str, file: Path) -> None:
@@ -300,18 +306,23 @@ def _is_for_a_framework(folder: Path) -> bool:
     return any(_imports(str(path), names) for path in sorted(folder.rglob("*.py"))[:_MOST_FILES])
 
 
-def _above_alias(form: Format, name: str, file: str) -> Any:
-    """Return what `import a.b.c` binds to the name `a`, if a format replaces `a.b` but not `a`.
+def _top_of(form: Format, name: str, file: str) -> Any:
+    """Return what `import a.b.c` binds to the name `a`, if a format replaces `a.b`.
 
-    The result is a copy of the package `a` in which the format's module takes the place of `a.b`.
+    If the package `a` has no `b`, the result is a copy of `a` in which the format's module is `a.b`. Then the format
+    does not replace `a`, or `a` is a package of the task that has the name of a framework's package.
 
     Args:
         form: the format that replaces the module.
         name: full name of the module, `a.b.c`.
         file: the importing file.
     """
-    first, second, *_ = name.split(".")
-    return _with_members(sys.modules[first], {second: _alias_module(form, f"{first}.{second}", file)})
+    first, _, rest = name.partition(".")
+    second = rest.partition(".")[0]
+    top = _alias_module(form, first, file) or sys.modules[first]
+    if not second or hasattr(top, second):
+        return top
+    return _with_members(top, {second: _alias_module(form, f"{first}.{second}", file)})
 
 
 def _alias_module(form: Format, name: str, file: str, below_top: bool = False) -> Any:

@@ -346,6 +346,16 @@ def test_compile_error_raises_config_error(tmp_path):
         build(arm(tmp_path, xml=xml))
 
 
+def test_model_that_does_not_compile_is_reported_before_its_joints(tmp_path):
+    xml = ARM.replace('<geom size="0.03" mass="0.2"', '<geom size="0.03" mass="0"').replace('mass="0.5"', 'mass="0"')
+    with pytest.raises(ConfigError) as caught:
+        build(arm(tmp_path, xml=xml, robot={"joints": {"elbo": {"damping": 1.0}}}))
+    assert [problem.path for problem in caught.value.problems] == [
+        "scene.entities.robot.model",
+        "scene.entities.robot.joints.elbo",
+    ]
+
+
 @pytest.mark.parametrize("number", [1, 2])
 def test_settotalmass_is_kept_for_each_entity(tmp_path, number):
     xml = ARM.replace('autolimits="true"', 'autolimits="true" settotalmass="14"')

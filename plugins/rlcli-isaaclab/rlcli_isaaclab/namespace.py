@@ -115,7 +115,7 @@ def module_of(name: str, file: str) -> ModuleType | None:
     top, _, inner = name.partition(".")
     # `isaaclab_tasks.utils` is replaced by this package's `task_utils`
     if top in _SOURCE_PACKAGES and not inner.startswith("utils"):
-        folder = _source_folder(top, Path(file).parent)
+        folder = _source_folder(top, Path(file).parent, inner.partition(".")[0])
         if folder is not None:
             return _of_source(name, folder, inner)
     if top in TRAINERS:
@@ -184,18 +184,23 @@ def _of_source(name: str, folder: Path, inner: str) -> ModuleType:
 
 
 @functools.cache
-def _source_folder(package: str, start: Path) -> Path | None:
-    """Return the folder with the original files of a package; None if there is none."""
+def _source_folder(package: str, start: Path, member: str) -> Path | None:
+    """Return the folder with the original files of a package; None if there is none.
+
+    Args:
+        package: name of the package. A repository may have a package of the same name: one with `member` is preferred.
+        start: folder of the importing file.
+        member: first module in the package that is imported; empty: only the package.
+    """
     places = [*start.resolve().parents]
     if os.environ.get(SOURCE):
         places.append(Path(os.environ[SOURCE]).expanduser())
     installed = importlib.util.find_spec("isaaclab")
     places += [Path(place) / "source" for place in (installed.submodule_search_locations or ())] if installed else []
-    for place in places:
-        for folder in (place / package, place / package / package, place / "source" / package / package):
-            if (folder / "__init__.py").is_file():
-                return folder
-    return None
+    inner = (Path(package), Path(package, package), Path("source", package, package))
+    found = [place / part for place in places for part in inner if (place / part / "__init__.py").is_file()]
+    whole = [f for f in found if not member or (f / member).is_dir() or (f / f"{member}.py").is_file()]
+    return next(iter(whole or found), None)
 
 
 @functools.cache

@@ -588,3 +588,26 @@ def test_message_has_the_name_that_a_package_has_in_its_files(tmp_path):
     start.write_text(f"from json.parts import missing\n{start.read_text()}")
     with pytest.raises(TaskError, match=r"cannot import name 'missing' from 'json\.parts'"):
         resolve(find_task(f"{package}:Template-Cartpole-v0"))
+
+
+def test_package_of_a_repository_with_the_name_of_isaac_labs_tasks(tmp_path, monkeypatch):
+    original = tmp_path / "source" / "isaaclab_tasks" / "isaaclab_tasks"
+    (original / "parts_of_lab").mkdir(parents=True)
+    (original / "__init__.py").write_text("")
+    (original / "parts_of_lab" / "__init__.py").write_text("NUMBER = 3\n")
+    monkeypatch.setenv("RLCLI_ISAACLAB", str(tmp_path / "source"))
+    own = tmp_path / "challenge" / "isaaclab_tasks"
+    own.mkdir(parents=True)
+    (own / "__init__.py").write_text("")
+    (own / "own_parts_of_test.py").write_text("NUMBER = 4\n")
+    lines = (
+        "from isaaclab_tasks.parts_of_lab import NUMBER\nfrom isaaclab_tasks.own_parts_of_test import NUMBER as OWN\n"
+    )
+    rover(own / "rover_of_test", f"{lines}assert (NUMBER, OWN) == (3, 4)\n")
+    (own / "packed").mkdir()
+    lines += "import isaaclab_tasks.parts_of_lab as parts\nassert (NUMBER, OWN, parts.NUMBER) == (3, 4, 3)\n"
+    (own / "packed" / "__init__.py").write_text(lines)
+    (own / "packed" / "rover_env.py").write_text((own / "rover_of_test" / "rover_env.py").read_text())
+    for file in ("rover.xml", "models.yaml"):
+        shutil.copy(own / "rover_of_test" / file, own / "packed" / file)
+    resolve(find_task(f"{own / 'packed' / 'rover_env.py'}:RoverEnvCfg"))
