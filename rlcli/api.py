@@ -34,6 +34,7 @@ from rlcli.training.signals import StopRequest
 from rlcli.training.start_run import TrainingRequest, broadcast_job, process_device, setup_job
 
 if TYPE_CHECKING:
+    from rlcli.registry.task_location import TaskSource
     from rlcli.training.progress import Progress
 
 
@@ -182,7 +183,7 @@ def load_policy(
     Raises:
         CheckpointError: if there is no such checkpoint, or it does not fit the environment.
     """
-    saved = open_checkpoint(_find(checkpoint, env.resolved.source.name, runs_dir))
+    saved = open_checkpoint(_find(checkpoint, env.resolved.source, runs_dir))
     require_fit(saved, env.layout)
     return trained_policy(env, saved.policy(), stochastic=stochastic)
 
@@ -219,10 +220,9 @@ def _check(seed: object, overrides: object) -> None:
         )
 
 
-def _find(checkpoint: Path | str | None, task: str | None, runs_dir: Path | str | None) -> Path:
+def _find(checkpoint: Path | str | None, task: TaskSource | None, runs_dir: Path | str | None) -> Path:
     """Return the folder of a checkpoint; without `checkpoint`, of the newest one of the task."""
-    source = None if task is None else find_task(task)
-    return choose(None if checkpoint is None else str(checkpoint), Path(runs_dir or default_runs_dir()), source).folder
+    return choose(None if checkpoint is None else str(checkpoint), Path(runs_dir or default_runs_dir()), task).folder
 
 
 class _ProgressCallback:

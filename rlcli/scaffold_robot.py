@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -75,7 +76,8 @@ def read_robot(file: Path, name: str, kind: str | None = None) -> RobotTask:
         raise UsageError(f"--robot: there is no file {file}", hint="give the MJCF of a robot, as in --robot robot.xml")
     try:
         spec = read_mjcf(file, _asset_roots(file.resolve()))
-        robot = Robot(spec, file)
+        with warnings.catch_warnings(action="ignore"):  # MuJoCo warns of deprecated attributes, which still work
+            robot = Robot(spec, file)
     except (BadModel, ValueError) as error:
         raise TaskError(
             f"{file} cannot be used: {error}", hint="correct the file; python -m mujoco.viewer --mjcf FILE shows it"

@@ -5,6 +5,7 @@ import torch
 
 from rlcli.api import evaluate, export, load_policy, make, train
 from rlcli.errors import ConfigError, TaskError, UsageError
+from rlcli.scaffold import create
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
 
@@ -54,6 +55,16 @@ def test_train_evaluate_act_and_export_work_together(tmp_path):
     env.close()
     done = export(first.run, tmp_path / "policy.py", format="numpy")
     assert done.file.is_file()
+
+
+def test_policy_of_a_task_in_a_folder_is_found(tmp_path):
+    create("my-arm", "yaml", tmp_path / "package", None)
+    folder = str(tmp_path / "package" / "my_arm")
+    run = train(folder, num_envs=4, max_iterations=1).run
+    env = make(folder, num_envs=2)
+    for checkpoint in (run, None):
+        assert load_policy(env, checkpoint)(env.reset()["policy"]).shape[0] == 2
+    env.close()
 
 
 def test_train_gives_the_weights_of_the_command(cli):
