@@ -1,4 +1,4 @@
-"""Reader of the docstrings below the fields of a model, which become descriptions in its JSON Schema."""
+"""Reader of the docstrings below the fields of a pydantic model: they become descriptions in its JSON Schema."""
 
 import ast
 import functools
@@ -12,7 +12,7 @@ from pydantic import BaseModel
 
 
 def describe(schema: dict[str, Any], model: type[BaseModel]) -> None:
-    """Add the strings below a model's fields to its JSON Schema, as `description`. Existing descriptions are kept."""
+    """Add the docstrings of a model's fields to its JSON Schema, as `description`. Existing descriptions are kept."""
     properties = schema.get("properties", {})
     for each in model.__mro__:
         module = each.__dict__.get("_defined_in")

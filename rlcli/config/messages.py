@@ -63,7 +63,7 @@ def problems(
     for path, items in grouped.items():
         if path in outer:
             continue  # one alternative of a union; the error of another alternative is more precise
-        message, hint, at = _message(path, items, model, data, locations or {})
+        message, hint, at = _message(path, items, model, data, locations or {}, top=not prefix)
         yield Problem(place(prefix + at), dotted(prefix + at), message, hint)
 
 
@@ -92,9 +92,12 @@ def key_locations(models: Mapping[str, type[BaseModel]]) -> dict[str, list[str]]
 
 
 def _message(
-    path: Path, items: list[Any], model: type[BaseModel], data: object, locations: KeyLocations
+    path: Path, items: list[Any], model: type[BaseModel], data: object, locations: KeyLocations, top: bool
 ) -> tuple[str, str | None, Path]:
-    """Return the message, the hint and the path to report for `items`, pydantic's errors at one path of the data."""
+    """Return the message, the hint and the path to report for `items`, pydantic's errors at one path of the data.
+
+    `top`: `model` is the model of a whole file.
+    """
     kind, found = items[0]["type"], items[0]["input"]
     if kind == "extra_forbidden":
         return f"unknown key '{path[-1]}'", _suggest_key(str(path[-1]), _fields(model, path[:-1]), locations), path
@@ -108,7 +111,9 @@ def _message(
     if refused:
         return str(refused[0]["ctx"]["error"]), None, path
     if kind == "missing" and isinstance(items[0]["loc"][-1], str):
-        return f"missing key '{path[-1]}'", None, path[:-1]
+        where = " at the top level" if top and len(path) == 1 else ""
+        own = "a new term needs 'func'; `rlcli terms` lists the functions" if path[-1] == "func" else None
+        return f"missing key '{path[-1]}'{where}", own, path[:-1]
     length = _length(model, path)
     if length is not None and kind in ("missing", "too_short", "too_long"):
         value: Any = functools.reduce(operator.getitem, path, data)  # type: ignore[arg-type]

@@ -275,7 +275,7 @@ def annotation_type(node: ast.expr) -> Any:
             return tuple[tuple(annotation_type(item) for item in items)]  # type: ignore[misc]
     raise SignatureError(
         f"YAML cannot express the annotation '{ast.unparse(node)}'; use float, int, bool, str, Literal, tuple,"
-        f" list, dict[str, X], X | None, Range, {', '.join(NAMED)} or {' / '.join(SELECTORS)}"
+        f" list, dict[str, X] or X | None, or an annotation of rlcli.task: Range, {', '.join((*NAMED, *SELECTORS))}"
     )
 
 

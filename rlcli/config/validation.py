@@ -359,7 +359,8 @@ class TaskCheck:
         model = base
         name = entry.get("func")
         if "func" not in entry and (similar := did_you_mean(str(path[-1]), self._siblings(path))):
-            self.problem(path, f"there is no term '{path[-1]}' to change", similar)  # a misspelt term in an override
+            message = f"there is no term '{path[-1]}' to change"  # a misspelt term in an override
+            self.problem(path, message, f"{similar}; a new term needs 'func'")
             return None
         if isinstance(name, str):
             signature = self.vocabulary.find(section, name)

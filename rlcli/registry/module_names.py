@@ -1,4 +1,4 @@
-"""Names of the modules of tasks: those in `sys.modules`, and those that the files of a task use."""
+"""Module names of tasks. A task's module has one name in `sys.modules` and may have another in the task's own files."""
 
 import re
 

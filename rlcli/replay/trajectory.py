@@ -360,10 +360,11 @@ def read_trajectory(file: Path) -> Trajectory:
         header = check_json(Header, data, file)
         _check_tensors(header, tensors)
     except FileNotFoundError:
-        message = f"there is no recording or dump {file}"
+        message = f"there is no recording, crash dump or failure case {file}"
         raise CheckpointError(message, hint="check the path; rlcli eval TASK --record FILE makes a recording") from None
     except (SafetensorError, OSError, ValueError, RecursionError) as error:
-        raise CheckpointError(f"{file} is no valid recording or dump: {' '.join(str(error).split())}") from None
+        message = f"{file} is no valid recording, crash dump or failure case: {' '.join(str(error).split())}"
+        raise CheckpointError(message, hint="check the path; rlcli eval TASK --record FILE makes a recording") from None
     return Trajectory(file, header, tensors)
 
 

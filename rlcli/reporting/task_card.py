@@ -145,7 +145,8 @@ def _columns(*titles: str) -> tuple[Column, ...]:
 
 def _facts(task: TaskConfig, layout: Mapping[str, Any]) -> Iterable[tuple[str, str]]:
     rate = 1.0 / task.step_dt
-    yield "Control period", f"{number(task.step_dt)} s ({number(rate)} Hz), {task.decimation} physics steps each"
+    steps = "one physics step" if task.decimation == 1 else f"{task.decimation} physics steps"
+    yield "Control period", f"{number(task.step_dt)} s ({number(rate)} Hz), {steps} each"
     yield "Physics step", f"{number(task.sim.dt)} s"
     yield "Episode", f"{number(task.episode_length_s)} s, {task.max_episode_length:,} steps"
     for kind, title in (("observations", "Observation"), ("actions", "Action")):

@@ -170,7 +170,10 @@ def _record_begin(job: Job, trainer: Trainer, env: Environment, budget: Budget) 
     unsaved = env.unsaved_state()
     if unsaved:
         names = ", ".join(unsaved)
-        _log.warning(f"a resumed run may differ from an uninterrupted one: no checkpoint can store {names}")
+        _log.warning(
+            f"a resumed run may differ from an uninterrupted one: no checkpoint can store {names}; keep the"
+            " state of the task in numbers, containers, tensors or generators of random numbers"
+        )
     exact = not unsaved and env.device.type == "cpu"
     job.run.update(state="running", since=datetime.now(UTC).isoformat(), iterations=budget.iterations(trainer))
     job.run.update(resumes_exactly=exact, **_provenance(job, trainer, env))

@@ -1,6 +1,7 @@
 """Benchmark of `rlcli bench`: speed of a task on this machine, and the sizes and threads that train fastest.
 
-Sizes are the number of environments, the steps of a rollout and the number of minibatches.
+Sizes are the number of environments, the steps of a rollout and the number of minibatches. Workers are processes that
+step a part of the environments each (`scene.workers`).
 
 Only settings that train equally are compared: they have the same number of samples in an iteration, and the same number
 and size of gradient steps. Then the time of an iteration decides the time to a solution. More steps per second with
@@ -36,7 +37,7 @@ HORIZONS = ("num_steps", "n_steps", "num_steps_per_env", "train_freq")
 UNSTEADY = 0.15
 """Relative spread above which a measurement is repeated, and the machine is reported as busy."""
 WORTH = 0.97
-"""Another setting is recommended only if its iteration takes less than this share of the present setting's time."""
+"""`rlcli bench` recommends another setting only if its iteration takes less than this share of the present time."""
 _ACTIONS = 8
 """Number of batches of random actions that the environments receive in turn."""
 _ENV_BYTES = 256 * 2**10

@@ -49,7 +49,11 @@ TYPOS = [
     ("rewards.alive=3", "rewards.alive: expected a mapping, found 3", None),
     ("rewards.alive.wieght=2", "rewards.alive.wieght: unknown key 'wieght'", "did you mean 'weight'?"),
     ("rewards.alive.weight=heavy", "rewards.alive.weight: expected a number, found 'heavy'", None),
-    ("rewards.aliv.weight=2", "rewards.aliv: there is no term 'aliv' to change", "did you mean 'alive'?"),
+    (
+        "rewards.aliv.weight=2",
+        "rewards.aliv: there is no term 'aliv' to change",
+        "did you mean 'alive'?; a new term needs",
+    ),
     ("rewards.aliv=null", "rewards.aliv: there is no such term to remove", "did you mean 'alive'?"),
     (
         "rewards.alive.func=is_alife",
@@ -59,7 +63,7 @@ TYPOS = [
     ("rewards.alive.func=3", "rewards.alive.func: expected text, found 3", None),
     ("rewards.alive.func=reset_scene_to_default", "no reward term", "is a term of events"),
     ("rewards.new={func: is_alive}", "rewards.new: missing key 'weight'", None),
-    ("rewards.new={weight: 1}", "rewards.new: missing key 'func'", None),
+    ("rewards.new={weight: 1}", "rewards.new: missing key 'func'", "a new term needs 'func'"),
     ("rewards.near.tagret=1", "rewards.near.tagret: unknown key 'tagret'", "did you mean 'target'?"),
     ("rewards.near.target=far", "rewards.near.target: expected a number, found 'far'", None),
     ("rewards.near.joints=[1]", "rewards.near.joints.0: expected text, found 1", None),
@@ -196,7 +200,7 @@ def test_require_agent_gives_hint(task, agents, message, hint):
 @pytest.mark.parametrize(
     ("missing", "said"),
     [
-        ("sim: {dt: 1/120}\n", "missing key 'sim'"),
+        ("sim: {dt: 1/120}\n", "missing key 'sim' at the top level"),
         ("decimation: 2\n", "missing key 'decimation'"),
         ("rewards:\n", None),
     ],

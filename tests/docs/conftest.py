@@ -1,5 +1,17 @@
+import importlib.util
+
 import pytest
 from support.built_pages import Page, build
+from support.fenced import REPOSITORY
+
+
+@pytest.fixture(scope="session")
+def reference():
+    """The module `docs/reference.py`."""
+    spec = importlib.util.spec_from_file_location("reference", REPOSITORY / "docs" / "reference.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 @pytest.fixture(scope="session")

@@ -1,6 +1,5 @@
 """Generated reference pages: up to date, complete, with examples that are valid."""
 
-import importlib.util
 import json
 
 import pytest
@@ -12,14 +11,6 @@ from rlcli.config.term_docs import term_entries
 from rlcli.config.term_signatures import SECTIONS, params_model
 
 DOCS = REPOSITORY / "docs"
-
-
-@pytest.fixture(scope="module")
-def reference():
-    spec = importlib.util.spec_from_file_location("reference", DOCS / "reference.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def test_committed_pages_equal_what_the_code_generates(reference):

@@ -253,7 +253,8 @@ def _sim(node: Node) -> dict[str, Any]:
             text = "the MJCF sets the friction of bodies; scene.ground.friction sets the friction of the ground"
             node.note("ignored", "physics_material", text)
     if node.data.get("physx"):
-        node.note("ignored", "physx", "MuJoCo's solver has its own settings: sim.iterations, sim.tolerance")
+        text = "MuJoCo's solver has its own settings: sim.iterations, sim.ls_iterations, the <option> of the MJCF"
+        node.note("ignored", "physx", text)
     return config
 
 

@@ -25,9 +25,9 @@ def command(
 
     Options:
         file: Recording of eval or play (--record), crash dump of a diverged simulation, or failure case of a run.
-        episode: Index of the episode to replay, from 0. [default: all]
-        video: Render one episode (that of --episode, else the first) to FILE.mp4 or FILE.gif. Without FILE:
-            replay.mp4.
+        episode: For a recording: index of the episode to replay, from 0. [default: all]
+        video: For a recording: render one episode (that of --episode, else the first) to FILE.mp4 or FILE.gif.
+            Without FILE: replay.mp4. `rlcli autopsy` renders failure cases.
 
     Examples:
         rlcli replay episodes.safetensors
