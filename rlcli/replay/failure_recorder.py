@@ -236,8 +236,8 @@ class FailureRecorder(StepObserver):
     def _choose(self, ended: Episodes) -> None:
         """Keep some of the ended episodes that diverged, have an outlier return, or were terminated.
 
-        One episode of each kind is kept per iteration: the first that diverged for a cause, the outlier with the lowest
-        and with the highest return, and for each set of terminations the episode with the lowest return.
+        One episode of each kind is kept per iteration: the first one for each cause of divergence, the outliers with
+        the lowest and the highest return, and for each set of terminations the episode with the lowest return.
         """
         returns, rest = ended.returns.detach().numpy().copy(), ~ended.truncated.numpy()
         self._returns.append(returns)

@@ -78,7 +78,7 @@ class PartMemory:
         return [(network, part, part_of) for network in range(2) for part, part_of in enumerate(self.split(rows))]
 
     def gradients_of(self, network: int, part: int) -> list[Tensor]:
-        """Return the tensors to which the gradients of one network (0: actor, 1: critic) and part are written.
+        """Return the tensors for the gradients of one network (0: actor, 1: critic) on one part of the minibatch.
 
         They are transposed: (inputs, outputs) for weights.
         """

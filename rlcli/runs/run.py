@@ -263,7 +263,7 @@ def require_own(run: Run, *parts: str) -> None:
             raise CheckpointError(message, hint=hint) from None
         if count > _MAX_FILES:
             message = f"{run.folder} has more than {_MAX_FILES} files"
-            raise CheckpointError(message, hint="move files that rlcli has not written out of the run's folder")
+            raise CheckpointError(message, hint="move files that are not rlcli's to another folder")
 
 
 def _require_task_name(name: str) -> str:

@@ -184,8 +184,9 @@ class Entity:
         """
         if self.root_qpos is None or self.root_dof is None:
             raise TaskError(
-                f"entity '{self.name}' is fixed to the world",
-                hint='add <freejoint/> to its body, or mocap="true" if only a reset moves it (a shape: free: true)',
+                f"entity '{self.name}' is fixed to the world: its root has no position or velocity to set or to read",
+                hint="remove the term that does this, or let the root move: add <freejoint/> to its body (with `shape`,"
+                ' set `free: true`); mocap="true" is enough if only resets move it',
             )
         return self.root_qpos, self.root_dof
 

@@ -42,7 +42,7 @@ def compile_update(
         reason = next(iter(str(error).strip().splitlines()), "")
         _log.warning(
             f"the update cannot be compiled and runs uncompiled ({type(error).__name__}: {reason[:200]});"
-            " `compile: false` avoids this warning"
+            " `agent.compile=false` avoids this warning"
         )
         return functions
     return compiled
