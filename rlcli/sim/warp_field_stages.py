@@ -50,7 +50,7 @@ class FieldStages:
         return {KINEMATICS if name in _KINEMATIC_FIELDS else FORCE if name in ACCELERATION_FIELDS else VELOCITY}
 
     def needs_only_motion(self, name: str) -> bool:
-        """Return whether a field can be derived from the state alone: contacts, constraints and inertias are not needed."""
+        """Return whether a field can be derived from positions and velocities, without contacts and inertias."""
         if name == "sensordata":
             return self._sensors_need_only_motion
         return VELOCITY not in self.stages_of(name) or name in _MOTION_FIELDS

@@ -64,7 +64,7 @@ class WarpWorlds:
         self._derived: set[int] = set()
         """Stages that compute requested derived fields."""
         self._needs_only_motion = True
-        """Whether the requested fields can be derived from the state alone: contacts, constraints and inertias are not needed."""
+        """Whether the requested fields can be derived from positions and velocities, without contacts and inertias."""
         self._overwritten: dict[str, wp.array] = {}
         """Copies of fields that `fwd_velocity` overwrites."""
         self._substep_fields = config.derived_fields == "substep"
