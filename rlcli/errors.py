@@ -176,10 +176,17 @@ def pip_install(package: str) -> str:
     return " ".join(["pip install", *(f'"{word}"' if set(word) & set(" []<>=*") else word for word in words)])
 
 
+_MAX_ERROR_TEXT = 20_000
+"""Longest message of an error that is read [characters]: longer ones take too much time to split and to escape."""
+
+
 def error_text(error: BaseException) -> str:
-    """Return the message of an error. If its `__str__` raises, as that of a task's class may, say so instead."""
+    """Return the message of an error, cut to `_MAX_ERROR_TEXT` characters.
+
+    If its `__str__` raises, as that of a task's class may, say so instead.
+    """
     try:
-        return str(error)
+        return str(error)[:_MAX_ERROR_TEXT]
     except BaseException as failed:
         return f"its message cannot be read: __str__ raises {type(failed).__name__}"
 

@@ -30,8 +30,8 @@ _MAX_SEARCH_BYTES = 64 * 1024**2
 """Bytes of the metrics that are searched for one row."""
 _MAX_FILES = 20_000
 _STARTING_S = 5.0
-"""Age up to which a run counts as running without a lock, because it may not have its lock yet [s]. A
-time stamp this far in the future comes from another clock."""
+"""Age up to which a folder without run.json may belong to a run that is being created [s]. A time stamp this far in the
+future comes from another clock."""
 
 
 @dataclass(slots=True)
@@ -129,10 +129,14 @@ def overview_of(run: Run) -> Overview:
 def state_of(run: Run) -> tuple[str, str | None]:
     """Return the state of a run, and the reason if it failed, diverged, was interrupted or is broken."""
     recorded = run.record.get("state", "")
+    if is_locked(run.folder):
+        return "running", None
+    if recorded == "running":  # it may have ended between the reading of its record and that of its lock
+        with contextlib.suppress(CheckpointError, OSError):
+            run.record = open_run(run.folder).record
+        recorded = run.record.get("state", "")
     why = run.record.get("reason")
     reason = why if isinstance(why, str) and recorded in ("diverged", "failed") else None
-    if is_locked(run.folder) or (recorded == "running" and abs(seconds_since(run.record.get("started"))) < _STARTING_S):
-        return "running", None
     if recorded in ENDED or recorded == WAITING:
         return recorded, reason
     if recorded == "running":

@@ -44,8 +44,15 @@ class Run:
     """Folder of one training run. `record` is the content of run.json: its task, seed, state and environment."""
 
     folder: Path
+    """The folder; absolute after `lock`, so that writing does not depend on the current folder, which a task may
+    change."""
     record: dict[str, Any] = field(default_factory=dict)
     _lock: RunLock | None = None
+    shown: Path = field(init=False)
+    """The folder as it was given, for messages."""
+
+    def __post_init__(self) -> None:
+        self.shown = self.folder
 
     @property
     def config(self) -> Path:
@@ -91,6 +98,7 @@ class Run:
         Raises:
             MachineError: if another process is writing to this run.
         """
+        self.folder = self.folder.absolute()
         lock = RunLock(self.folder)
         with disk_errors(self.folder / LOCK):
             lock.acquire()

@@ -181,7 +181,7 @@ def create_imported_run(
         run.discard()
         raise
     run.unlock()
-    return run.folder
+    return run.shown
 
 
 def _named_tensors(saved: object, where: str) -> dict[str, Tensor]:

@@ -102,7 +102,7 @@ class TrainLoop:
                     iteration, step = self._boundary
                     self.writer.save_cases(iteration + 1, step + self.trainer.steps_per_iteration)
             if isinstance(error, MachineError):
-                resume = f"then continue with `rlcli train --resume {shlex.quote(str(self.run.folder))}`"
+                resume = f"then continue with `rlcli train --resume {shlex.quote(str(self.run.shown))}`"
                 error.hint = f"{error.hint}; {resume}" if error.hint else f"correct this, {resume}"
             raise
 
@@ -228,7 +228,7 @@ class TrainLoop:
 
     def _stopped(self, message: str) -> Stopped:
         """Return the error of a stopped run, with the command that resumes it."""
-        hint = f"rlcli train --resume {shlex.quote(str(self.run.folder))}"
+        hint = f"rlcli train --resume {shlex.quote(str(self.run.shown))}"
         have_checkpoint = checkpoint_reader.steps(self.run.checkpoints)
         return Stopped(message, exit_code=self.stop.exit_code, hint=hint if have_checkpoint else None)
 

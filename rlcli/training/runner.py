@@ -82,10 +82,10 @@ def run_training(
     _warn_of_physics(env)
     if not job.writes:
         return None
-    newest = run.checkpoints / f"{steps(run.checkpoints)[-1]:012d}"
+    newest = Run(run.shown).checkpoints / f"{steps(run.checkpoints)[-1]:012d}"
     elapsed, step, new_steps = time.monotonic() - job.begin, trainer.env_steps, trainer.env_steps - first_step
     ended = loop.metrics, run.record["state"]
-    return TrainingResult(run.folder, newest, step, trainer.iteration, elapsed, run.record["seed"], new_steps, *ended)
+    return TrainingResult(run.shown, newest, step, trainer.iteration, elapsed, run.record["seed"], new_steps, *ended)
 
 
 def _train(job: Job, trainer: Trainer, env: Environment, stop: StopRequest, view: ProgressView) -> TrainLoop:
@@ -141,7 +141,7 @@ def _train(job: Job, trainer: Trainer, env: Environment, stop: StopRequest, view
     is_done = loop.reached or budgets[-1].spent(trainer)
     close("finished" if is_done else "stopped")
     if not is_done:
-        again = f"rlcli train --resume {shlex.quote(str(run.folder))} continues it"
+        again = f"rlcli train --resume {shlex.quote(str(run.shown))} continues it"
         _log.info(f"stopped after {agent.max_minutes:g} minutes, in iteration {trainer.iteration}; {again}")
     if job.writes and agent.until is not None:
         _report_bar(run, agent.until, loop.reached)

@@ -124,7 +124,7 @@ def new_run(request: TrainingRequest, resolved: Resolved, device: str) -> Job:
     record = run_record(request, resolved, device)
     config = to_yaml(to_data(resolved))
     run = create_run(request.runs, resolved.source.name, request.name, config, record)
-    _log.info("run %s", run.folder)
+    _log.info("run %s", run.shown)
     init_from = record["init_from"] and Path(record["init_from"])
     return Job(run, resolved, record["loggers"], init_from=init_from, video_every=record["video_every"])
 
@@ -219,9 +219,9 @@ def resume_run(request: TrainingRequest) -> Job | TrainingResult:
         run.unlock()
         raise
     if run.record.get("state") == WAITING:
-        _log.info("run %s", run.folder)
+        _log.info("run %s", run.shown)
     elif folder is None:
-        _log.info("%s (%s) ended before its first checkpoint: it starts again", run.folder, why)
+        _log.info("%s (%s) ended before its first checkpoint: it starts again", run.shown, why)
     else:
         _log.info("resuming %s (%s)", folder, why)
     initial = run.record.get("init_from") if folder is None else None

@@ -70,6 +70,8 @@ def open_study(folder: Path, settings: Mapping[str, Any], storage: str | None, *
                 return optuna.load_study(**study)
             return optuna.create_study(**study, direction=settings["direction"], load_if_exists=True)
         except KeyError:
+            if storage is None and (folder / JOURNAL).stat().st_size > 0:
+                raise _corrupt(folder / JOURNAL, ValueError(f"it has no entry of the sweep '{name}'")) from None
             where = without_password(storage) if storage else folder
             raise CheckpointError(f"there is no sweep '{name}' in {where}; see `rlcli sweep show`") from None
 

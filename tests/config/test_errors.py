@@ -104,6 +104,11 @@ TYPOS = [
     ("num_envs=1", "num_envs: unknown key", "it belongs in scene (scene.num_envs)"),
     ("gamma=1", "gamma: unknown key", "it belongs in agent (agent.gamma)"),
     ("sim.decimation=1", "sim.decimation: unknown key", "it belongs at the top level"),
+    (
+        "agent.eval_episodes=1000000000",
+        "agents.one.eval_episodes: expected a whole number <= 1000000, found 1000000000",
+        None,
+    ),
     ("agent.num_envs=1", "agents.one.num_envs: unknown key", "it belongs in scene (scene.num_envs)"),
     ("scene.entities.robot.kp=1", "unknown key 'kp'", "scene.entities.NAME.joints.NAME"),
 ]

@@ -1,5 +1,6 @@
 """Code of a task that hangs, warns, or raises errors of the system: each is reported once, with its file and line."""
 
+import json
 import os
 import subprocess
 import sys
@@ -258,3 +259,15 @@ def test_text_of_an_error_of_a_task_is_short(with_code, cli, text):
     assert len(error.partition(f":{line}: calculate_metrics: ")[2].replace("\\x1b", "x")) <= 200
     assert "\nhint: run" not in found.err
     assert "\x1b" not in found.err
+
+
+@pytest.mark.parametrize("hook", ["calculate_metrics", "reset_idx"])
+def test_task_that_changes_the_current_folder_is_trained(with_code, start, tmp_path, hook):
+    with_code(hook, "os.chdir('/')")
+    process = start(*TRAIN[:-1], "--max-iterations", "1")
+    out, err = process.communicate()
+    assert process.returncode == 0, err
+    (run,) = Path("runs/coin").iterdir()
+    assert out == f"{run}\n"
+    assert f"run {run}\n" in err
+    assert json.loads((run / "run.json").read_text())["state"] == "finished"

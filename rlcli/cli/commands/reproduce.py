@@ -55,10 +55,10 @@ def command(
     last = last_iteration(original)
     until = last if iterations is None else min(iterations, last)
     run, env_steps, rows = _train_again(original, until, runs, name, force)
-    console.info(f"trained {until} of {last} iterations again in {run.folder}")
+    console.info(f"trained {until} of {last} iterations again in {run.shown}")
     sections = compare(original, run, sections=("metrics", "weights", "policy"), until=env_steps)
     more = {"iterations": until, "environment": [_entry(row) for row in rows]}
-    if not report_differences("reproduce", sections, str(original.folder), str(run.folder), **more):
+    if not report_differences("reproduce", sections, str(original.folder), str(run.shown), **more):
         raise typer.Exit(9)
 
 

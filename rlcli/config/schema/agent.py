@@ -67,8 +67,8 @@ class AgentConfig(StrictModel):
     eval_interval: Count | None = None
     """Iterations between two evaluations of the policy, as `rlcli eval` does them; null: no evaluations. RUN@best is
     the checkpoint with the best evaluation."""
-    eval_episodes: Count = 100
-    """Number of episodes of each evaluation of `eval_interval`."""
+    eval_episodes: Annotated[int, Field(ge=1, le=1_000_000)] = 100
+    """Number of episodes of each evaluation of `eval_interval`; the training waits for their end."""
     until: Annotated[str, AfterValidator(_check_threshold)] | None = None
     """Threshold at which training ends before its budget: success=X, return=X or length=X. It is reached when the lower
     end of an evaluation's 95 % interval is at least X. With a threshold, `eval_interval: null` means a twentieth of the

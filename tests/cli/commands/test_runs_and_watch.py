@@ -17,7 +17,7 @@ import pytest
 
 from rlcli.cli.commands.runs import age_text, size_text
 from rlcli.runs.eval_store import write_evaluation
-from rlcli.runs.overview import overviews
+from rlcli.runs.overview import overviews, state_of
 from rlcli.runs.run import create_run, open_run
 from rlcli.runs.run_lock import is_locked
 
@@ -106,6 +106,21 @@ def test_unlocked_running_run_is_interrupted(cli, made, checkpoint, step, resuma
         (run.folder / "run.json").write_text(json.dumps(record))
     (found,) = listed(cli)
     assert (found["state"], found["resumable"]) == ("interrupted", resumable)
+
+
+def test_run_that_is_killed_at_once_is_interrupted_at_once(cli, made):
+    made("a", [row(1)], "running", started=datetime.now(UTC).isoformat())
+    (found,) = listed(cli)
+    assert (found["state"], found["reason"]) == ("interrupted", "its process was killed, or the machine stopped")
+
+
+def test_run_that_ends_while_it_is_read_is_not_interrupted(made):
+    """The record is read before the lock: a reader may have an old record of a run that is not locked any more."""
+    run = made("a", [row(1)])
+    read = open_run(run.folder)
+    run.update(state="failed", reason="the disk is full")
+    run.unlock()
+    assert state_of(read) == ("failed", "the disk is full")
 
 
 @pytest.mark.parametrize("hours", [1, 24 * 365])

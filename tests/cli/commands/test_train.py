@@ -406,7 +406,7 @@ def test_moved_run_folder_is_named_and_not_created_again(cli, only_run, monkeypa
     monkeypatch.setattr(Sb3Trainer, "iterate", iterate)
     done = cli("train", "cartpole", *SMALL, "--max-iterations", 2)
     assert done.code == 10, done.err
-    assert "(there is no folder runs/cartpole/" in done.err
+    assert f"(there is no folder {Path('runs/cartpole').absolute()}/" in done.err
     assert "was moved or deleted meanwhile, put it back; then continue with `rlcli train --resume runs/" in done.err
     assert list(Path("runs").glob("*/*")) == []
 
