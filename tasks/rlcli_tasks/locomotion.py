@@ -209,7 +209,7 @@ class LocomotionTask(DirectTask):
         }
 
     def calculate_metrics(self) -> None:
-        """Write the rewards to `rew_buf`: progress, posture and survival, minus costs; `death_reward` for a fall."""
+        """Reward progress, posture and survival, minus costs; for a fall the reward is `death_reward` alone."""
         params, obs, actions = self.params, self.obs_buf, self.actions
         cost = (actions * obs[:, self.joint_vel]).abs_().mul_(self.energy_cost)
         cost.addcmul_(actions, actions, value=params.action_cost)
@@ -222,7 +222,7 @@ class LocomotionTask(DirectTask):
         self.rew_buf.copy_(reward.masked_fill_(self._fallen(), params.death_reward))
 
     def is_done(self) -> None:
-        """Write to `reset_buf` where the torso is too low. The environment adds time-outs."""
+        """Terminate where the torso is too low. The environment adds time-outs."""
         self.reset_buf.copy_(self._fallen())
 
     def _measure_speed(self) -> None:

@@ -134,7 +134,7 @@ def test_position_to_limits_rejects_unlimited_joint(tmp_path):
     task = yaml.safe_load(PENDULUM_TASK)
     task["actions"] = {"move": {"func": "joint_position_to_limits"}}
     task["scene"]["entities"]["robot"]["joints"] = {"swing": {"kp": 1.0}}
-    with pytest.raises(ConfigError, match="'swing' has no limits"):
+    with pytest.raises(ConfigError, match="'swing' has no position limits"):
         build(write(tmp_path, dump(task), pendulum_xml=PENDULUM), 2)
 
 

@@ -340,7 +340,7 @@ MASS = {"asset_cfg": Pick("robot"), "mass_distribution_params": (0.0, 1.0), "ope
         ("events", "randomize_rigid_body_com", {"asset_cfg": Pick("robot"), "com_range": {"roll": (0.0, 1.0)}},
          "expected ranges for x, y and z"),
         ("events", "randomize_physics_scene_gravity", {"gravity_distribution_params": (0.0, 1.0)},
-         r"expected two numbers|expected \(\[x, y, z\]"),
+         r"expected two numbers|expected \(lowest, highest\), each \[x, y, z\]"),
         ("events", "randomize_rigid_body_material", {"asset_cfg": Pick("robot")}, "missing 'dynamic_friction_range'"),
         ("events", "randomize_actuator_gains",
          {"asset_cfg": Pick("cabinet"), "stiffness_distribution_params": (1.0, 2.0)}, "no actuator of 'cabinet'"),

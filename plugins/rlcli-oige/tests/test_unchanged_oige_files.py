@@ -247,7 +247,7 @@ def test_convolutions_become_cnn():
     [
         ("padding: 0", "padding: 1", "no padding"),
         ("type: conv2d", "type: conv1d", "'conv1d' has no counterpart"),
-        ("convs: [{filters: 8, kernel_size: 4, strides: 2, padding: 0}]", "convs: 3", "layers of convolutions"),
+        ("convs: [{filters: 8, kernel_size: 4, strides: 2, padding: 0}]", "convs: 3", "a list `convs` with its layers"),
     ],
 )
 def test_other_convolutions_are_refused(old, new, message):

@@ -135,11 +135,11 @@ class BallBalanceTask(DirectTask):
         )
 
     def calculate_metrics(self) -> None:
-        """Write the rewards to `rew_buf`: 1 for a ball at rest in the middle, less with distance and speed."""
+        """Reward a ball that is slow and near the middle; at rest in the middle the reward is 1."""
         speed = torch.linalg.vector_norm(self.obs_buf[:, BALL_VEL], dim=1)
         torch.linalg.vector_norm(self.obs_buf[:, BALL_POS] - self.goal, dim=1, out=self.distance)
         self.rew_buf.copy_(((1.0 + self.distance) * (1.0 + speed)).reciprocal_())
 
     def is_done(self) -> None:
-        """Write to `reset_buf` where the ball has fallen off the table. The environment adds time-outs."""
+        """Terminate where the ball has fallen off the table. The environment adds time-outs."""
         self.reset_buf.copy_(self.obs_buf[:, BALL_POS][:, 2] < self.params.fall_height)

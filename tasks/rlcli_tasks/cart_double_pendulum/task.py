@@ -116,7 +116,7 @@ class CartDoublePendulumTask(DirectTask):
         }
 
     def calculate_metrics(self) -> None:
-        """Write the rewards to `rew_buf`: for survival, minus penalties on tilt and speed; a failure has a cost."""
+        """Reward survival, upright links and slow joints; a failure has a cost."""
         params = self.params
         _, cart_vel, pole, pole_vel, tilt, _, pendulum_vel = self.obs_buf.unbind(dim=1)
         self.rew_buf.fill_(params.alive_weight).masked_fill_(self._failed(), params.failure_reward)
@@ -124,7 +124,7 @@ class CartDoublePendulumTask(DirectTask):
         self.rew_buf.sub_(cart_vel.abs() + pole_vel.abs() + pendulum_vel.abs(), alpha=params.speed_weight)
 
     def is_done(self) -> None:
-        """Write to `reset_buf` where the cart left the rail or the pole fell. The environment adds time-outs."""
+        """Terminate where the cart left the rail or the pole fell. The environment adds time-outs."""
         self.reset_buf.copy_(self._failed())
 
     def _failed(self) -> Tensor:

@@ -88,7 +88,7 @@ class CartpoleTask(DirectTask):
         }
 
     def calculate_metrics(self) -> None:
-        """Write the rewards to `rew_buf`: 1, minus penalties on the pole's angle and on speeds; -2 for a failure."""
+        """Reward an upright pole and slow joints; a failure costs 2."""
         _, cart_vel, pole_pos, pole_vel = self.obs_buf.unbind(dim=1)
         reward = 1.0 - pole_pos.square()
         reward -= self.params.cart_vel_weight * cart_vel.abs()
@@ -96,7 +96,7 @@ class CartpoleTask(DirectTask):
         self.rew_buf[:] = torch.where(self._failed(), -2.0, reward)
 
     def is_done(self) -> None:
-        """Write to `reset_buf` where the cart left the rail or the pole fell. The environment adds time-outs."""
+        """Terminate where the cart left the rail or the pole fell. The environment adds time-outs."""
         self.reset_buf[:] = self._failed()
 
     def _failed(self) -> Tensor:

@@ -102,10 +102,9 @@ class CrazyflieTask(FlightTask):
         )
 
     def calculate_metrics(self) -> None:
-        """Write the rewards to `rew_buf`.
+        """Reward nearness to the target, and near the target an upright pose without spin.
 
-        They are for nearness to the target, and near the target for an upright pose without spin. The penalty on
-        actions is largest at action 0.
+        The penalty on actions is largest at action 0.
         """
         self.distance.copy_(length(self.to_target))
         near = (1.0 + self.distance).reciprocal_()
@@ -116,7 +115,7 @@ class CrazyflieTask(FlightTask):
         self.rew_buf.copy_(reward.sub_(low_effort, alpha=self.params.effort_cost))
 
     def is_done(self) -> None:
-        """Write to `reset_buf` where the drone is too far, too low, too high or upside down, without time-outs."""
+        """Terminate where the drone is too far, too low, too high or upside down. The environment adds time-outs."""
         low, high = self.params.height_range
         height = self.robot.data.root_pos_w[:, 2]
         outside = (height < low) | (height > high)

@@ -193,10 +193,9 @@ class HandTask(DirectTask):
         )
 
     def calculate_metrics(self) -> None:
-        """Write the rewards to `rew_buf`, and sample a new goal where the goal is reached.
+        """Reward a cube near its position and goal orientation, minus a penalty on actions; add a bonus for a goal.
 
-        The reward is for a cube near its position and goal orientation, minus a penalty on actions, plus a bonus for a
-        reached goal.
+        Where a goal is reached, sample the next one.
         """
         params, cube = self.params, self.cube.data
         self.distance.copy_(length(cube.root_pos_w - self.goal_pos))
@@ -217,7 +216,7 @@ class HandTask(DirectTask):
                 self.states_buf[:, GOAL] = self.obs_buf[:, GOAL]
 
     def is_done(self) -> None:
-        """Write to `reset_buf` where the cube has fallen. The environment adds time-outs."""
+        """Terminate where the cube has fallen. The environment adds time-outs."""
         self.reset_buf.copy_(self.distance >= self.params.fall_distance)
 
     def _draw_goal(self, selection: Selection) -> None:

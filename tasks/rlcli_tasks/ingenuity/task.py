@@ -86,11 +86,7 @@ class IngenuityTask(FlightTask):
         ).div_(self.units)
 
     def calculate_metrics(self) -> None:
-        """Write the rewards to `rew_buf`.
-
-        They are for nearness to the target, and near the target for an upright pose, no spin and, with the parameter
-        `steadiness`, a low speed.
-        """
+        """Reward nearness to the target, and near it an upright pose, no spin and (`steadiness`) a low speed."""
         data = self.robot.data
         self.distance.copy_(length(self.to_target))
         _, x, y, _ = data.root_quat_w.unbind(dim=1)
@@ -104,6 +100,6 @@ class IngenuityTask(FlightTask):
             self.rew_buf.addcmul_(near, rest, value=self.params.steadiness)
 
     def is_done(self) -> None:
-        """Write to `reset_buf` where the robot is too far or too low. The environment adds time-outs."""
+        """Terminate where the robot is too far or too low. The environment adds time-outs."""
         low = self.robot.data.root_pos_w[:, 2] < self.params.min_height
         self.reset_buf.copy_((self.distance > self.params.max_distance) | low)

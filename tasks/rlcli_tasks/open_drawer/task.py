@@ -162,7 +162,7 @@ class DrawerTask(DirectTask):
         )
 
     def calculate_metrics(self) -> None:
-        """Write the rewards to `rew_buf`: for nearness, orientation, grasp and opening, minus a penalty on actions."""
+        """Reward nearness, orientation, grasp and opening, minus a penalty on actions."""
         params, arm = self.params, self.robot.data
         self.opening.copy_(self.obs_buf[:, OPENING])
         opening, distance = self.opening, length(self.obs_buf[:, WAY])
@@ -191,5 +191,5 @@ class DrawerTask(DirectTask):
         self.rew_buf.copy_(reward)
 
     def is_done(self) -> None:
-        """Write False to `reset_buf`: episodes only end by time-out, because the drawer must be held open."""
+        """Never terminate: episodes only end by time-out, because the drawer must be held open."""
         self.reset_buf.zero_()

@@ -111,7 +111,7 @@ class QuadcopterTask(DirectTask):
         ).div_(self.units)
 
     def calculate_metrics(self) -> None:
-        """Write the rewards to `rew_buf`: for nearness, and near the target for an upright pose without spin."""
+        """Reward nearness to the target, and near the target an upright pose without spin."""
         data = self.robot.data
         self.distance.copy_(length(self.to_target))
         _, x, y, _ = data.root_quat_w.unbind(dim=1)
@@ -122,6 +122,6 @@ class QuadcopterTask(DirectTask):
         torch.clamp(near + near * posture, min=0.0, out=self.rew_buf)
 
     def is_done(self) -> None:
-        """Write to `reset_buf` where the robot is too far or too low. The environment adds time-outs."""
+        """Terminate where the robot is too far or too low. The environment adds time-outs."""
         low = self.robot.data.root_pos_w[:, 2] < self.params.min_height
         self.reset_buf.copy_((self.distance > self.params.max_distance) | low)
