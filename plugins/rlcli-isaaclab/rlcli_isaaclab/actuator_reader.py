@@ -228,17 +228,14 @@ def _merge(
 
 
 def _passive_joints(settings: JointSettings, model: Mapping[str, Any], driven: Mapping[str, str]) -> list[str]:
-    """Return the joints whose position an action commands without effect, because their drive has no stiffness."""
-    found = []
-    for joint, command in driven.items():
-        values = settings_of(joint, settings)
-        if (
-            command == "position"
-            and joint not in model["driven"]
-            and 0.0 in (values.get("stiffness"), values.get("effort_limit"))
-        ):
-            found.append(joint)
-    return found
+    """Return the joints whose position an action commands without effect, because their drive has no stiffness.
+
+    If no joint has a drive, the list is empty: then the actions are a mistake, which the environment reports.
+    """
+    commanded = [joint for joint, command in driven.items() if command == "position"]
+    values = {joint: settings_of(joint, settings) for joint in commanded if joint not in model["driven"]}
+    passive = [n for n, v in values.items() if 0.0 in (v.get("stiffness"), v.get("effort_limit"))]
+    return passive if len(passive) < len(commanded) else []
 
 
 def _joint_config(
