@@ -28,6 +28,8 @@ def own_fields(cfg: Any, base: type) -> tuple[dict[str, Any], type[BaseModel]]:
     for name, value in vars(cfg).items():
         if name in known or name.startswith(("_", "rlcli_")):
             continue
+        if isinstance(value, type):  # a class is no setting that could be changed by its members
+            continue
         if dataclasses.is_dataclass(value) and not is_framework(type(value).__module__):
             inner, kind = own_fields(value, _Nothing)
             if inner:

@@ -170,6 +170,15 @@ def test_direct_task_groups_prims_and_observes_arrays_of_two_dimensions(direct):
     assert torch.equal(obs[:, 3:], 2.0 * obs[:, :3])
 
 
+def test_field_of_a_direct_task_that_is_a_configuration_class(direct):
+    spare = "@configclass\nclass SpareCfg:\n    size = 1.0\n\n\n"
+    text = DIRECT.replace("    force = 5.0\n", "    force = 5.0\n    kind: type = SpareCfg\n")
+    direct.write_text(text.replace("@configclass\nclass PoleEnvCfg", f"{spare}@configclass\nclass PoleEnvCfg"))
+    params = resolve(find_task(f"{direct}:PoleEnvCfg")).task.params
+    assert "force" in params
+    assert "kind" not in params
+
+
 def test_direct_task_cannot_read_meshes_of_the_stage_while_its_scene_is_set_up(direct):
     stage = "from isaacsim.core.utils.stage import get_current_stage\n"
     read = '        get_current_stage().GetPrimAtPath("/World/terrain").IsValid()\n'
