@@ -102,10 +102,11 @@ def _train(job: Job, trainer: Trainer, env: Environment, stop: StopRequest, view
 
     def close(state: str, reason: str | None = None) -> None:
         with contextlib.ExitStack() as stack:  # closes all loggers even if one of them fails; then updates the run
-            if job.writes and writer.written is not None:
-                iteration, step = writer.written
-                trained_s = trained_before + time.monotonic() - job.begin
-                end = {"state": state, "reason": reason, "trained_s": trained_s, "iteration": iteration, "step": step}
+            end: dict[str, Any] = {"state": state, "reason": reason}
+            if writer.written is not None:  # without a checkpoint the run has no step, and starts again
+                end["iteration"], end["step"] = writer.written
+                end["trained_s"] = trained_before + time.monotonic() - job.begin
+            if job.writes:
                 stack.callback(lambda: run.update(**end))
             for logger in loggers:
                 stack.callback(logger.close, state)

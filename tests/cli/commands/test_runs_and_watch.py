@@ -5,6 +5,7 @@ import os
 import pty
 import re
 import select
+import shlex
 import signal
 import subprocess
 import sys
@@ -461,3 +462,14 @@ def test_links_in_a_folder_of_runs_are_not_followed(cli, made, tmp_path):
     assert result.json["runs"] == []
     for link in ("runs/root", "runs/arm", "runs/own/linked"):
         assert result.err.count(f"{link} is a link; rlcli does not search it") == 1
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="sizes of files are limited by Linux")
+def test_training_that_cannot_write_its_first_checkpoint_has_failed(cli):
+    words = ("train", *SMALL, "--max-iterations", 4, "--device", "cpu")
+    command = "ulimit -f 8; exec " + shlex.join([sys.executable, "-m", "rlcli", *map(str, words)])
+    assert subprocess.run(["bash", "-c", command], capture_output=True).returncode == 10
+    (found,) = listed(cli)
+    assert (found["state"], found["resumable"]) == ("failed", True)
+    assert "File too large" in found["reason"]
+    assert cli("train", "--resume", "latest", "--max-iterations", 1, "-q").code == 0
