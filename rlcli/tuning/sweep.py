@@ -23,7 +23,7 @@ from rlcli.reporting.matplotlib_plots import check_drawing, scatter
 from rlcli.runs.atomic_io import disk_error, disk_errors, to_json, write_atomic
 from rlcli.runs.run import STUDY
 from rlcli.runs.safe_io import Count, FileModel, check_json
-from rlcli.runs.study import read_study
+from rlcli.runs.study import read_study, require_plain_study
 from rlcli.tuning.optuna_storage import open_study, without_password
 from rlcli.tuning.search_space import Parameter, read_parameters
 
@@ -284,6 +284,7 @@ def open_sweep(
         CheckpointError: if the files of the sweep are damaged.
         MachineError: if the storage cannot be reached, or the folder cannot be written.
     """
+    require_plain_study(folder)
     with disk_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
     record = {"kind": "sweep", **settings, "source": dict(source)}

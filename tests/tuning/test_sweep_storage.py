@@ -1,6 +1,7 @@
 """Trials of a sweep without training: claims of several processes, sampled values, and damaged storage."""
 
 import json
+import os
 import threading
 
 import pytest
@@ -182,6 +183,40 @@ def test_damaged_result_is_checkpoint_error(tmp_path, old, new):
     (tmp_path / JOURNAL).write_bytes(content.replace(old, new))
     with pytest.raises(CheckpointError, match="corrupt: trial 0"):
         read_sweep(tmp_path).trials()
+
+
+def tree(folder):
+    """Path of each entry below a folder -> content of the file; None for folders."""
+    return {path: path.read_bytes() if path.is_file() else None for path in sorted(folder.rglob("*"))}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("trial-0001", "compare-default-seed-0", "trial-0000/checkpoints", "trial-0000/checkpoints/logs"),
+        *("trial-0000/train.log", "trial-0000/.worker", "study.json", "journal.log", "best.yaml", ".sweep"),
+    ],
+)
+@pytest.mark.parametrize("kind", ["link", "pipe"])
+def test_sweep_with_a_link_or_pipe_is_refused_and_nothing_is_written(tmp_path, name, kind, cli):
+    sweep, victim = tmp_path / "sweep", tmp_path / "victim"
+    finish(open_or_join(sweep), 1)
+    (victim / "checkpoints").mkdir(parents=True)
+    (victim / "config.yaml").write_text("kept")
+    entry = sweep / name
+    entry.parent.mkdir(exist_ok=True)
+    entry.unlink(missing_ok=True)
+    if kind == "link":
+        entry.symlink_to(victim if "." not in entry.name else victim / "config.yaml")
+    else:
+        os.mkfifo(entry)
+    before = tree(tmp_path)
+    for look in (open_or_join, read_sweep):
+        with pytest.raises(CheckpointError, match=f"{entry.name} is (a link|not a regular file)"):
+            look(sweep)
+    for words in (("show", sweep), ("compare", sweep)):
+        assert cli("sweep", *words).code == 5
+    assert tree(tmp_path) == before
 
 
 def test_missing_journal_is_checkpoint_error(tmp_path):
