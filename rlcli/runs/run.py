@@ -307,7 +307,7 @@ class TaskRecord(FileModel):
     distribution: PrintableText | None = None
 
 
-class _InstalledTask(TaskRecord):
+class RecordedTask(TaskRecord):
     """Entry `task` of run.json, which must say where the task comes from: a folder or an installed distribution."""
 
     @model_validator(mode="after")
@@ -335,7 +335,7 @@ def seconds_since(stamp: object) -> float:
 class RunRecord(FileModel):
     """The entries of run.json that rlcli reads."""
 
-    task: _InstalledTask
+    task: RecordedTask
     seed: Annotated[int, Field(ge=0, le=MAX_SEED)]
     agent: str | None = None
     best: int | None = None

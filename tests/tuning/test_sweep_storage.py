@@ -242,6 +242,54 @@ def test_task_from_other_folder_is_other_sweep(tmp_path):
         open_or_join(tmp_path, source={"name": "cartpole", "distribution": None, "folder": "/two"})
 
 
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        *(("params", value) for value in ([{}], [[]], {}, "a", None, ["a"], ["agent.gamma=0.9:0.8"])),
+        *(("overrides", [1]), ("flags", []), ("source", {}), ("source", {"name": 1}), ("trials", "3"), ("seed", -1)),
+        *(("direction", "up"), ("pruner", 1), ("objective", "a\nb"), ("storage", {}), ("config", 1)),
+    ],
+)
+def test_wrong_type_in_study_file_is_checkpoint_error(tmp_path, key, value, cli):
+    open_or_join(tmp_path)
+    record = json.loads((tmp_path / "study.json").read_text())
+    (tmp_path / "study.json").write_text(json.dumps({**record, key: value}))
+    for form in ((), ("--json",)):
+        done = cli("sweep", "show", tmp_path, *form)
+        assert done.code == 5
+        assert f"study.json is corrupt: {key}" in (done.out if form else done.err)
+
+
+@pytest.mark.parametrize("value", [[[]], [], 1, "text", {"params": [[]]}])
+def test_wrong_type_of_the_settings_in_the_journal_is_checkpoint_error(tmp_path, value):
+    open_or_join(tmp_path)
+    journal = tmp_path / JOURNAL
+    entries = [json.loads(line) for line in journal.read_text().splitlines()]
+    entries[-1]["user_attr"] = {"rlcli": value}
+    journal.write_text("".join(json.dumps(entry) + "\n" for entry in entries))
+    with pytest.raises(CheckpointError, match=r"journal\.log is corrupt: rlcli"):
+        open_or_join(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "entry",
+    [
+        {"op_code": 7, "step": 1, "intermediate_value": "high"},
+        {"op_code": 5, "param_name": "agent.n_steps", "param_value_internal": 0, "distribution": "CHOICE"},
+        {"op_code": 5, "param_name": "agent.learning_rate", "param_value_internal": 0, "distribution": "CHOICE"},
+        {"op_code": 8, "user_attr": {"seconds": [1]}},
+    ],
+)
+def test_wrong_value_of_a_running_trial_is_checkpoint_error(tmp_path, entry):
+    open_or_join(tmp_path).study.ask()
+    choice = json.dumps({"name": "CategoricalDistribution", "attributes": {"choices": ["x", "y"]}})
+    entry = {"worker_id": "w", "trial_id": 0, **{k: choice if v == "CHOICE" else v for k, v in entry.items()}}
+    with (tmp_path / JOURNAL).open("a") as journal:
+        journal.write(json.dumps(entry) + "\n")
+    with pytest.raises(CheckpointError, match="is corrupt: trial 0"):
+        read_sweep(tmp_path).trials()
+
+
 @pytest.mark.parametrize("text", ["{", "[]", '{"kind": "sweep", "task": "cartpole"}', '{"kind": "seeds", "task": "a"}'])
 def test_malformed_study_file_is_checkpoint_error(tmp_path, text):
     open_or_join(tmp_path)
