@@ -13,6 +13,7 @@ from rlcli.config.dump import to_data
 from rlcli.config.load import resolve
 from rlcli.envs.make import make_env
 from rlcli.registry import find_task, folder_task
+from rlcli_isaaclab.importer import read
 
 torch.set_num_threads(1)
 HERE = Path(__file__).parent
@@ -239,3 +240,32 @@ def test_pipe_and_endless_file_are_not_read(tmp_path, capsys):
         assert main(["import", "isaaclab", str(file), "-o", str(tmp_path / "out")]) == 3
         assert why in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("pattern", "message"),
+    [
+        ("x[31m", "neither the name of a joint nor a regular expression"),
+        ("(([a-z_]*)*)*X", "can take exponential time"),
+        ("slider" + ".*" * 30, "the pattern"),
+    ],
+)
+@pytest.mark.parametrize("place", ["actions", "actuators", "init", "gains"])
+def test_pattern_that_is_invalid_or_hangs_is_refused(imported, place, pattern, message):
+    data = read(ENV)
+    robot = data["scene"]["robot"]
+    group = robot["actuators"]["cart_actuator"]
+    if place == "actions":
+        data["actions"]["joint_effort"]["joint_names"] = [pattern]
+    elif place == "init":
+        robot["init_state"]["joint_pos"] = {pattern: 0.0}
+    elif place == "gains":
+        group["damping"] = {pattern: 1.0}
+    else:
+        group["joint_names_expr"] = [pattern, 5]
+    code, document, _, folder = imported(yaml.dump(data))
+    assert code == 3
+    messages = [problem["message"] for problem in document["error"]["problems"]]
+    assert len([text for text in messages if message in text]) == 1, messages
+    assert any("found 5" in text for text in messages) == (place == "actuators")
+    assert not folder.exists()
