@@ -187,9 +187,15 @@ def initialize_run(folder: Path, config: str, record: Mapping[str, Any]) -> Run:
     run = Run(folder)
     with disk_errors(folder, remove=True):
         run.lock()
-        run.checkpoints.mkdir()
-        write_atomic(run.config, config)
-        run.update(**{"started": datetime.now(UTC).isoformat(timespec="microseconds"), "state": "running", **record})
+        try:
+            run.checkpoints.mkdir()
+            write_atomic(run.config, config)
+            run.update(
+                **{"started": datetime.now(UTC).isoformat(timespec="microseconds"), "state": "running", **record}
+            )
+        except BaseException:
+            run.unlock()
+            raise
     return run
 
 
