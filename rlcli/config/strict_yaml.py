@@ -5,6 +5,7 @@ with its position: duplicate keys, anchors, tags, merge keys, a second document,
 `.nan`).
 """
 
+import contextlib
 import functools
 import itertools
 import math
@@ -64,7 +65,7 @@ def load(text: str | bytes) -> Document:
     Raises:
         YamlError: with the position of the first mistake.
     """
-    value, marks = _parse(_decode(text))
+    value, marks = _parse(decode(text))
     if value is None:
         value = {}
     if not isinstance(value, dict):
@@ -78,10 +79,15 @@ def load_value(text: str) -> Any:
     Raises:
         YamlError: with the position of the first mistake.
     """
-    return _parse(_decode(text))[0]
+    return _parse(decode(text))[0]
 
 
-def _decode(text: str | bytes) -> str:
+def decode(text: str | bytes) -> str:
+    """Return the text of a file.
+
+    Raises:
+        YamlError: if the file is too large or not UTF-8.
+    """
     if len(text) > MAX_BYTES:
         raise YamlError(f"the file is larger than {MAX_BYTES} bytes; make it smaller")
     if isinstance(text, bytes):
@@ -115,8 +121,15 @@ def _copy(value: Any) -> Any:
 
 @functools.lru_cache(maxsize=8)  # a command reads the same file several times: for its format, then as a task
 def _parse_cached(text: str) -> tuple[Any, dict[Path, Mark]]:
-    try:
+    with syntax_errors(text):
         return _read(text)
+
+
+@contextlib.contextmanager
+def syntax_errors(text: str) -> Iterator[None]:
+    """Turn PyYAML's errors about a text, in the block, into YamlErrors with their position."""
+    try:
+        yield
     except yaml.MarkedYAMLError as error:
         raise YamlError(
             error.problem or error.context or "syntax error", error.problem_mark or error.context_mark
@@ -126,16 +139,24 @@ def _parse_cached(text: str) -> tuple[Any, dict[Path, Mark]]:
         raise YamlError(found, place=_after(text[: error.position])) from None
 
 
+class Loader(yaml.SafeLoader):  # type: ignore[misc]
+    """PyYAML's safe loader. An escape that is no character is an error with its position."""
+
+    def fetch_more_tokens(self) -> Any:
+        """Read the next tokens of the text."""
+        try:
+            return super().fetch_more_tokens()
+        except (ValueError, OverflowError):  # an escape such as "\\U00110000"
+            message = "an escape (\\x, \\u or \\U) is not a Unicode character; correct it"
+            raise yaml.MarkedYAMLError(problem=message, problem_mark=self.get_mark()) from None
+
+
 def _events(text: str) -> Iterator[events.Event]:
     """Yield PyYAML's parsing events of a text."""
-    loader = yaml.SafeLoader(text)
+    loader = Loader(text)
     try:
         while loader.check_event():
             yield loader.get_event()
-    except (ValueError, OverflowError):  # an escape such as "\\U00110000"
-        raise YamlError(
-            "an escape (\\x, \\u or \\U) is not a Unicode character; correct it", loader.get_mark()
-        ) from None
     finally:
         loader.dispose()
 
@@ -214,6 +235,17 @@ def _position(event: events.Event) -> Mark:
     return event.start_mark.line + 1, event.start_mark.column + 1
 
 
+def check_scalar(event: events.ScalarEvent) -> str:
+    """Return the text of a scalar, which has at most `MAX_SCALAR` characters and no half of a surrogate pair."""
+    text: str = event.value
+    if len(text) > MAX_SCALAR:
+        raise YamlError(f"the value is longer than {MAX_SCALAR} characters; shorten it", event.start_mark)
+    if _SURROGATE.search(text):
+        raise YamlError("half of a surrogate pair (\\ud800 to \\udfff) is not a character; remove it", event.start_mark)
+    remember_input([text])
+    return text
+
+
 def _scalar(event: events.ScalarEvent, *, key: bool) -> Any:
     """Return the value of a scalar by the rules of YAML 1.2.
 
@@ -224,12 +256,7 @@ def _scalar(event: events.ScalarEvent, *, key: bool) -> Any:
     Raises:
         YamlError: for a scalar that parsers of YAML 1.1 read differently, such as `on` or `010`.
     """
-    text = event.value
-    if len(text) > MAX_SCALAR:
-        raise YamlError(f"the value is longer than {MAX_SCALAR} characters; shorten it", event.start_mark)
-    if _SURROGATE.search(text):
-        raise YamlError("half of a surrogate pair (\\ud800 to \\udfff) is not a character; remove it", event.start_mark)
-    remember_input([text])
+    text = check_scalar(event)
     if not event.implicit[0]:  # quoted or block: always text
         return text
     if key and text == "<<":

@@ -19,7 +19,7 @@ from rlcli.replay.resimulate import Staged, stage
 from rlcli.replay.trajectory import Episode, Failure, Trajectory, World, read_trajectory
 from rlcli.runs.atomic_io import finite_json
 from rlcli.runs.run import Run
-from rlcli.runs.safe_io import read_errors, refuse_links, require_inside
+from rlcli.runs.safe_io import read_errors, require_inside, require_plain_entries
 
 _log = logging.getLogger(__name__)
 FOLDER = "autopsy"
@@ -128,7 +128,7 @@ def list_failure_cases(run: Run) -> list[FailureCase]:
         return []
     with read_errors(folder):
         require_inside(run.folder, folder)
-    refuse_links(folder)
+    require_plain_entries(folder)
     cases = []
     for file in sorted(file for file in folder.iterdir() if FILE_NAME.fullmatch(file.name))[:_MAX_FILES]:
         try:

@@ -7,6 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from pydantic import Field
+
 from rlcli.config.load import Resolved, resolve
 from rlcli.envs.layout import Layout
 from rlcli.errors import CheckpointError, TaskError
@@ -15,7 +17,8 @@ from rlcli.rl.policy import Policy
 from rlcli.runs import trusted_tasks
 from rlcli.runs.checkpoint_reader import Checkpoint
 from rlcli.runs.run import Run
-from rlcli.runs.safe_io import read_errors, require_inside
+from rlcli.runs.safe_io import FileModel, check_json, read_errors, require_inside
+from rlcli.safe_text import shorten
 
 
 def source_of(run: Run, named: TaskSource | None = None) -> TaskSource:
@@ -97,19 +100,34 @@ def require_fit(checkpoint: Checkpoint, layout: Layout) -> None:
     Raises:
         CheckpointError: with a table of the differences.
     """
-    try:
-        differing = _differing_rows(checkpoint.manifest["layout"], layout.record())
-    except (AttributeError, KeyError, TypeError, ValueError):
-        raise CheckpointError(
-            f"{checkpoint.folder}: the record of the observation and action columns (layout) in manifest.json is"
-            " damaged; use another checkpoint: RUN@step:N"
-        ) from None
+    saved, file = checkpoint.manifest.get("layout"), checkpoint.folder / "manifest.json"
+    check_json(_SavedLayout, saved, file, "layout", hint="use another checkpoint: RUN@step:N")
+    differing = _differing_rows(checkpoint.manifest["layout"], layout.record())
     if not differing:
         return
     table = _table([("field", "in the checkpoint", "now"), *differing])
     names = "manifest.json" if "bundle" in checkpoint.manifest else "run.json"
     lines = [f"{checkpoint.folder} does not fit the installed task:", *table]
     raise CheckpointError(lines, hint=f"install the task's version that {names} names, or train again")
+
+
+class _SavedTerm(FileModel):
+    """Columns of a term in a layout, which may be of an older version of rlcli that lacks some keys."""
+
+    name: str
+    size: int
+    elements: list[str] = Field(default_factory=list)
+    scale: list[float] | None = None
+    offset: list[float] | None = None
+    clip: list[float | list[float | None] | None] | None = None
+    history: int = 1
+    modifiers: list[dict[str, Any]] = Field(default_factory=list)
+
+
+class _SavedLayout(FileModel):
+    observations: dict[str, list[_SavedTerm]]
+    actions: list[_SavedTerm]
+    step_dt: float | None = None
 
 
 def require_trainer(checkpoint: Checkpoint, trainer: str) -> None:
@@ -146,7 +164,12 @@ def require_same_policy(checkpoint: Checkpoint, policy: Policy, trainer: str) ->
         raise CheckpointError([title, *table], hint=hint)
 
 
+_MAX_CELL = 200
+"""Longest text in a column of a table of differences [characters]."""
+
+
 def _table(rows: Sequence[tuple[str, str, str]]) -> list[str]:
+    rows = [(shorten(a, _MAX_CELL), shorten(b, _MAX_CELL), shorten(c, _MAX_CELL)) for a, b, c in rows]
     widths = [max(len(row[column]) for row in rows) for column in range(2)]
     return [f"  {a.ljust(widths[0])}  {b.ljust(widths[1])}  {c}" for a, b, c in rows]
 

@@ -22,7 +22,15 @@ from rlcli.config import strict_yaml
 from rlcli.errors import CheckpointError, MachineError, UsageError
 from rlcli.runs.atomic_io import disk_errors, require_lock, to_json, write_atomic
 from rlcli.runs.run_lock import LOCK, RunLock
-from rlcli.runs.safe_io import FileModel, PrintableText, check_json, read_file, read_json, refuse_links, require_inside
+from rlcli.runs.safe_io import (
+    FileModel,
+    PrintableText,
+    check_json,
+    read_file,
+    read_json,
+    require_inside,
+    require_plain_entries,
+)
 from rlcli.safe_text import MAX_SEED
 
 _log = logging.getLogger(__name__)
@@ -179,9 +187,15 @@ def initialize_run(folder: Path, config: str, record: Mapping[str, Any]) -> Run:
     run = Run(folder)
     with disk_errors(folder, remove=True):
         run.lock()
-        run.checkpoints.mkdir()
-        write_atomic(run.config, config)
-        run.update(**{"started": datetime.now(UTC).isoformat(timespec="microseconds"), "state": "running", **record})
+        try:
+            run.checkpoints.mkdir()
+            write_atomic(run.config, config)
+            run.update(
+                **{"started": datetime.now(UTC).isoformat(timespec="microseconds"), "state": "running", **record}
+            )
+        except BaseException:
+            run.unlock()
+            raise
     return run
 
 
@@ -192,15 +206,23 @@ def open_run(folder: Path) -> Run:
         CheckpointError: if the folder is not a valid run.
     """
     record = read_json(folder, RECORD, missing=f"{folder} is not a run, because it has no {RECORD}; check the path")
-    refuse_links(folder)
-    for inner in ("checkpoints", "checkpoints/logs"):
-        if (folder / inner).is_dir():
-            refuse_links(folder / inner)
+    require_plain_run(folder)
     for part in (folder / CONFIG, folder / "metrics.jsonl"):
-        if part.exists() and not part.is_file():
-            raise CheckpointError(f"{part} is not a regular file; move it out of the run")  # reading a pipe would block
+        if part.is_dir():
+            raise CheckpointError(f"{part} is not a regular file; move it out of the run")
     check_json(RunRecord, record, folder / RECORD)
     return Run(folder, record)
+
+
+def require_plain_run(folder: Path) -> None:
+    """Check that the folders of a run into which rlcli writes contain only regular files and folders.
+
+    Raises:
+        CheckpointError: with the first other entry.
+    """
+    for inner in ("", "checkpoints", "checkpoints/logs"):
+        if (folder / inner).is_dir():
+            require_plain_entries(folder / inner)
 
 
 def run_folders(runs_dir: Path) -> Iterator[Path]:
@@ -291,7 +313,7 @@ class TaskRecord(FileModel):
     distribution: PrintableText | None = None
 
 
-class _InstalledTask(TaskRecord):
+class RecordedTask(TaskRecord):
     """Entry `task` of run.json, which must say where the task comes from: a folder or an installed distribution."""
 
     @model_validator(mode="after")
@@ -319,7 +341,7 @@ def seconds_since(stamp: object) -> float:
 class RunRecord(FileModel):
     """The entries of run.json that rlcli reads."""
 
-    task: _InstalledTask
+    task: RecordedTask
     seed: Annotated[int, Field(ge=0, le=MAX_SEED)]
     agent: str | None = None
     best: int | None = None

@@ -219,18 +219,24 @@ def require_inside(folder: Path, file: Path) -> None:
         raise OSError(errno.ELOOP, "it is a link out of the folder; replace it by the file itself", str(file))
 
 
-def refuse_links(folder: Path) -> None:
-    """Check that a folder of a run has no links: a write through a link would change files outside the run.
+def require_plain_entries(folder: Path) -> None:
+    """Check that a folder of a run contains only regular files and folders.
+
+    A write through a link would change files outside the run, and opening a pipe would block.
 
     Raises:
-        CheckpointError: with the first link.
+        CheckpointError: with the first other entry.
     """
     try:
-        links = sorted(entry.name for entry in os.scandir(folder) if entry.is_symlink())
+        entries = sorted(os.scandir(folder), key=lambda entry: entry.name)
+        links = [entry.name for entry in entries if entry.is_symlink()]
+        special = [entry.name for entry in entries if not (entry.is_file() or entry.is_dir())]
     except OSError as error:
         raise CheckpointError(f"{folder} cannot be read: {error.strerror}") from None
     if links:
         raise CheckpointError(f"{folder / links[0]} is a link; replace it by the file itself")
+    if special:
+        raise CheckpointError(f"{folder / special[0]} is not a regular file; move it out of the run")
 
 
 class _StrictError(ValueError):

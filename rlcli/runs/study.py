@@ -12,8 +12,8 @@ from pydantic import Field
 
 from rlcli.errors import CheckpointError, UsageError
 from rlcli.runs.atomic_io import disk_errors, to_json, write_atomic
-from rlcli.runs.run import STUDY, WAITING, initialize_run, new_folder
-from rlcli.runs.safe_io import FileModel, check_json, read_json
+from rlcli.runs.run import STUDY, WAITING, initialize_run, new_folder, require_plain_run
+from rlcli.runs.safe_io import FileModel, check_json, read_json, require_plain_entries
 from rlcli.safe_text import MAX_SEED
 
 _MAX_SEEDS = 1000
@@ -85,8 +85,10 @@ def read_study(folder: Path, kind: str = "seeds") -> dict[str, Any]:
     """Read and check study.json of a study. `kind` is `seeds` (runs of several seeds) or `sweep`.
 
     Raises:
-        CheckpointError: if the folder is not a study of this kind, or its record is malformed.
+        CheckpointError: if the folder is not a study of this kind, or its record is malformed, or the
+            folder or one of its runs has links or pipes.
     """
+    require_plain_study(folder)
     record = read_json(
         folder, STUDY, _LIMIT, missing=f"{folder} is not a study of several runs: it has no {STUDY}; check the path"
     )
@@ -94,6 +96,18 @@ def read_study(folder: Path, kind: str = "seeds") -> dict[str, Any]:
     if record["kind"] != kind:
         raise CheckpointError(f"{folder} is of kind {record['kind']}, expected {kind}; choose another folder")
     return record
+
+
+def require_plain_study(folder: Path) -> None:
+    """Check that a study and its runs contain only regular files and folders; a folder that does not exist is valid.
+
+    Raises:
+        CheckpointError: with the first other entry.
+    """
+    if folder.is_dir():
+        require_plain_entries(folder)
+        for run in sorted(entry for entry in folder.iterdir() if entry.is_dir()):
+            require_plain_run(run)
 
 
 def runs_of(folder: Path, record: Mapping[str, Any]) -> list[Path]:

@@ -1,7 +1,6 @@
 """Safe reading of models saved by torch and Stable-Baselines3: only tensors and plain data are unpickled."""
 
 import io
-import pickletools
 import re
 import stat
 import warnings
@@ -14,28 +13,13 @@ import torch
 
 from rlcli.errors import CheckpointError, one_line
 from rlcli.machine.memory import available_memory
+from rlcli.runs import pickle_check
 from rlcli.runs.safe_io import read_file
 
 _MAX_BYTES = 4 * 2**30
 """Largest size of a file, and of all members of a zip together [bytes]."""
 _MAX_RATIO = 100
 _MAX_MEMBERS = 20_000
-_PICKLE_LIMIT = 4 * 2**20
-_ALLOWED = {
-    "collections OrderedDict",
-    "torch._utils _rebuild_tensor_v2",
-    "torch._utils _rebuild_parameter",
-    *(
-        f"torch {kind}Storage"
-        for kind in ("Float", "Double", "Half", "BFloat16", "Long", "Int", "Short", "Byte", "Bool")
-    ),
-}
-"""Global names that the pickle in a .pt file may contain; a file with another name is refused."""
-_REFUSED_OPCODES = {"STACK_GLOBAL", "INST", "OBJ", "NEWOBJ", "NEWOBJ_EX", "EXT1", "EXT2", "EXT4", "PERSID"}
-_SAVE_HINT = (
-    "save it again in Python: torch.save({'model_state_dict': policy.state_dict()}, 'model.pt') for RSL-RL,"
-    " model.save('model.zip') for Stable-Baselines3"
-)
 VEC_NORMALIZE_HINT = (
     "a pickle can run code, so rlcli opens none; if you trust the file, convert it in Python:"
     " v = pickle.load(open('vecnormalize.pkl', 'rb')).obs_rms; safetensors.numpy.save_file("
@@ -134,34 +118,21 @@ def read_tensors(data: bytes, where: str) -> Mapping[str, Any]:
         raise CheckpointError(
             f"{where} is {kind}, which rlcli does not open; accepted is a .pt file of torch 1.6 or newer with only"
             " tensors",
-            hint=_SAVE_HINT,
+            hint=pickle_check.SAVE_HINT,
         )
     archive = _archive(data, where)
     described = [name for name in archive.namelist() if name.rpartition("/")[2] == "data.pkl"]
-    if len(described) != 1 or archive.getinfo(described[0]).file_size > _PICKLE_LIMIT:
+    if len(described) != 1 or archive.getinfo(described[0]).file_size > pickle_check.MAX_BYTES:
         raise CheckpointError(
             f"{where} is not a torch file: its data.pkl is missing or too large; save it again with torch.save"
         )
-    _require_tensors_only(_content(archive, described[0], where), where)
+    pickle_check.require_tensors_only(_content(archive, described[0], where), where)
     try:
         with warnings.catch_warnings(action="ignore"):
             saved = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
     except Exception:  # torch's own message advises to unpickle the file without any check
         message = f"{where} is corrupt, or has more than tensors, numbers and text"
-        raise CheckpointError(message, hint=_SAVE_HINT) from None
+        raise CheckpointError(message, hint=pickle_check.SAVE_HINT) from None
     if not isinstance(saved, Mapping):
-        raise CheckpointError(f"{where} is not a mapping of names to tensors", hint=_SAVE_HINT)
+        raise CheckpointError(f"{where} is not a mapping of names to tensors", hint=pickle_check.SAVE_HINT)
     return saved
-
-
-def _require_tensors_only(description: bytes, where: str) -> None:
-    """Check that a pickle, which is not executed, creates only tensors and plain data. `where` names its file."""
-    try:
-        for opcode, argument, _ in pickletools.genops(description):
-            if opcode.name in _REFUSED_OPCODES or (opcode.name == "GLOBAL" and argument not in _ALLOWED):
-                found = f"names '{str(argument)[:80]}'" if argument is not None else "creates objects"
-                raise CheckpointError(f"{where} {found}, which is not a tensor", hint=_SAVE_HINT)
-    except CheckpointError:
-        raise
-    except Exception as error:
-        raise CheckpointError(f"{where} is corrupt: {one_line(error)}; save the file again") from None

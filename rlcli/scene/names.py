@@ -55,7 +55,7 @@ def match(patterns: str | Sequence[str], names: Sequence[str], what: str) -> lis
     """
     positions: list[int] = []
     for pattern in [patterns] if isinstance(patterns, str) else patterns:
-        found = [names.index(pattern)] if pattern in names else _search(pattern, names, what)
+        found = [names.index(pattern)] if pattern in names else _search_any(pattern, names, what)
         for position in found:
             if position in positions:
                 message = f"{what} '{names[position]}' is matched twice; narrow the second pattern, '{pattern}'"
@@ -88,7 +88,12 @@ def match_values(values: Mapping[str, Value], names: Sequence[str], what: str) -
     return found
 
 
-def _search(pattern: str, names: Sequence[str], what: str) -> list[int]:
+def search(pattern: str, names: Sequence[str], what: str) -> list[int]:
+    """Return the indices of the names that a regular expression matches completely.
+
+    Raises:
+        NameProblem: if the text is no regular expression, or one that may take longer than a second.
+    """
     _require_cheap(pattern, max(map(len, names), default=0))
     try:
         with warnings.catch_warnings():
@@ -97,7 +102,11 @@ def _search(pattern: str, names: Sequence[str], what: str) -> list[int]:
     except (re.error, OverflowError, RecursionError, FutureWarning) as error:
         message = f"'{pattern}' is neither the name of a {what} nor a regular expression ({error}); correct it"
         raise NameProblem(message) from None
-    found = [position for position, name in enumerate(names) if regex.fullmatch(name)]
+    return [position for position, name in enumerate(names) if regex.fullmatch(name)]
+
+
+def _search_any(pattern: str, names: Sequence[str], what: str) -> list[int]:
+    found = search(pattern, names, what)
     if not found:
         suggestion = did_you_mean(pattern, names)
         existing = f"{'bodies' if what == 'body' else f'{what}s'}: {listing(names)}"

@@ -110,8 +110,6 @@ def _journal(folder: Path, create: bool) -> optuna.storages.BaseStorage:
     from optuna.storages.journal import JournalFileBackend
 
     file = folder / JOURNAL
-    if file.is_symlink():
-        raise CheckpointError(f"{file} is a link, which rlcli does not open; replace it by the file itself")
     if file.exists() and not (file.is_file() and file.stat().st_size <= _MAX_JOURNAL):
         raise CheckpointError(f"{file} is not a regular file of at most {_MAX_JOURNAL:,} bytes; choose another --name")
     if not create and not file.is_file():

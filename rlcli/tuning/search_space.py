@@ -53,6 +53,12 @@ class Parameter:
         suggest = trial.suggest_int if isinstance(self.low, int) else trial.suggest_float
         return suggest(self.key, *self.bounds, log=self.log)
 
+    def is_valid(self, stored: object) -> bool:
+        """Return whether a stored value is one of the choices, or a number of the range."""
+        if self.choices:
+            return stored in [_to_line(choice) for choice in self.choices]
+        return type(stored) in (int, float) and self.low <= stored <= self.high  # type: ignore[operator]
+
     def value(self, stored: Any) -> Any:
         """Convert the value that Optuna has stored for a trial (a choice is stored as text)."""
         if not self.choices:

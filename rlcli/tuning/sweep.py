@@ -12,7 +12,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from filelock import FileLock, Timeout
 
@@ -21,10 +21,10 @@ from rlcli.errors import CheckpointError, MachineError, UsageError, listing
 from rlcli.random import derive
 from rlcli.reporting.matplotlib_plots import check_drawing, scatter
 from rlcli.runs.atomic_io import disk_error, disk_errors, to_json, write_atomic
-from rlcli.runs.run import STUDY
-from rlcli.runs.safe_io import Count, FileModel, check_json
-from rlcli.runs.study import read_study
-from rlcli.tuning.optuna_storage import open_study, without_password
+from rlcli.runs.run import STUDY, RecordedTask
+from rlcli.runs.safe_io import Count, FileModel, PrintableText, check_json
+from rlcli.runs.study import read_study, require_plain_study
+from rlcli.tuning.optuna_storage import JOURNAL, open_study, without_password
 from rlcli.tuning.search_space import Parameter, read_parameters
 
 if TYPE_CHECKING:
@@ -40,22 +40,41 @@ _LOCATION = "place"
 """Attribute of a trial with the machine and the folder of its run; the trial can only be resumed there."""
 _SURPLUS = "surplus"
 """Attribute of a trial that another machine started in excess of the wanted number; it does not count."""
-_KINDS: dict[str, type] = {
-    **dict.fromkeys(("task", "name", "agent", "objective", "direction", "pruner"), str),
-    **dict.fromkeys(("trials", "episodes", "seed"), int),
-    **dict.fromkeys(("params", "overrides"), list),
-    **dict.fromkeys(("source", "flags"), dict),
-}
-"""Name of an entry of a sweep's `study.json` -> its type."""
 _ENDED = ("COMPLETE", "PRUNED", "FAIL")
 
 
+class _SweepSettings(FileModel):
+    """Settings of a sweep, as `study.json` and the study's attribute `rlcli` store them."""
+
+    task: PrintableText
+    name: PrintableText
+    agent: PrintableText
+    objective: PrintableText
+    direction: Literal["maximize", "minimize"]
+    pruner: Literal["median", "none"]
+    trials: Count
+    episodes: Count
+    seed: Count
+    params: list[str]
+    overrides: list[str]
+    flags: dict[str, Any]
+    config: str | None = None
+    storage: PrintableText | None = None
+
+
+class _SweepRecord(_SweepSettings):
+    """Content of a sweep's `study.json`: its settings, and where its task comes from."""
+
+    source: RecordedTask
+
+
 class _TrialNotes(FileModel):
-    """Entries that `Sweep.tell` stores with a trial: training time [s], environment steps, and why the trial failed."""
+    """What a sweep stores with a trial: training time [s], environment steps, the error, and reports to the pruner."""
 
     seconds: float | None = None
     step: Count | None = None
     why: str | None = None
+    reports: list[float]
 
 
 class _FinishedTrial(_TrialNotes):
@@ -100,10 +119,14 @@ class Sweep:
         trials = [trial for trial in self.study.get_trials(deepcopy=False) if _SURPLUS not in trial.user_attrs]
         for trial in trials:
             kind = _FinishedTrial if trial.state.name == "COMPLETE" else _TrialNotes
-            check_json(kind, {**trial.user_attrs, "values": trial.values}, self.folder, f"trial {trial.number}")
-            missing = [p.key for p in self.parameters if p.key not in trial.params]
-            if kind is _FinishedTrial and missing:
-                raise CheckpointError(f"{self.folder} is corrupt: trial {trial.number} has no value of {missing[0]}")
+            reports = list(trial.intermediate_values.values())
+            notes = {**trial.user_attrs, "values": trial.values, "reports": reports}
+            check_json(kind, notes, self.folder, f"trial {trial.number}")
+            for parameter in self.parameters:
+                known = parameter.key in trial.params
+                if not (parameter.is_valid(trial.params[parameter.key]) if known else kind is not _FinishedTrial):
+                    message = f"trial {trial.number} has no valid value of {parameter.key}"
+                    raise CheckpointError(f"{self.folder} is corrupt: {message}")
         return trials
 
     def ended(self) -> list[FrozenTrial]:
@@ -284,16 +307,19 @@ def open_sweep(
         CheckpointError: if the files of the sweep are damaged.
         MachineError: if the storage cannot be reached, or the folder cannot be written.
     """
+    require_plain_study(folder)
     with disk_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
     record = {"kind": "sweep", **settings, "source": dict(source)}
     with _locked(folder / _SWEEP_LOCK):
         exists = (folder / STUDY).is_file()
         if exists:
-            _require_same(folder, read_study(folder, "sweep"), record)
+            _require_same(folder, _read_record(folder), record)
         study = open_study(folder, settings, storage, create=storage is not None or not exists)
         known = study.user_attrs.get(_SETTINGS)
         if known is not None:
+            where = folder / JOURNAL if storage is None else Path(without_password(storage))
+            check_json(_SweepSettings, known, where, _SETTINGS)
             _require_same(storage or folder, known, settings)
         study.set_user_attr(_SETTINGS, settings)
         write_atomic(folder / STUDY, to_json(record))
@@ -307,13 +333,26 @@ def read_sweep(folder: Path, storage: str | None = None) -> Sweep:
         CheckpointError: if it does not exist or is damaged.
         MachineError: if its storage cannot be reached.
     """
-    settings = read_study(folder, "sweep")
-    if any(not isinstance(settings.get(key), kind) for key, kind in _KINDS.items()):
-        raise CheckpointError(f"{folder / STUDY} is corrupt: settings are missing; start a new sweep")
+    settings = _read_record(folder)
     if settings.get("storage") and storage is None:
         raise UsageError(f"{folder} has its trials in a database", hint="add the --storage URL of the sweep")
     study = open_study(folder, settings, storage, create=False)
-    return Sweep(folder, settings, read_parameters(settings["params"]), study)
+    try:
+        parameters = read_parameters(settings["params"])
+    except UsageError as error:
+        raise CheckpointError(f"{folder / STUDY} is corrupt: params: {error.message}") from None
+    return Sweep(folder, settings, parameters, study)
+
+
+def _read_record(folder: Path) -> dict[str, Any]:
+    """Return the content of a sweep's `study.json`.
+
+    Raises:
+        CheckpointError: if the folder has no sweep, or an entry has a wrong type.
+    """
+    record = read_study(folder, "sweep")
+    check_json(_SweepRecord, record, folder / STUDY, hint="start a new sweep with another --name")
+    return record
 
 
 def find_sweep(words: Sequence[str], runs: Path, storage: str | None) -> Sweep:

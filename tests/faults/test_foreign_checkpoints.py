@@ -31,6 +31,7 @@ from rlcli.errors import CheckpointError
 from rlcli.registry import find_task
 from rlcli.rl.policy import load_policy
 from rlcli.runs.checkpoint_reader import open_checkpoint
+from rlcli.runs.untrusted_weights import read_tensors
 from rlcli.training.import_policy import read_rsl_rl, read_sb3
 
 ALGORITHMS = {"ppo": PPO, "a2c": A2C, "sac": SAC, "td3": TD3}
@@ -657,7 +658,7 @@ def test_damaged_file_is_refused_or_read_unchanged(form):
 
 def test_refusal_of_torch_is_no_advice_to_unpickle(capfd):
     """The opcodes are those of tensors, but torch's unpickler refuses the sequence."""
-    Path("model.pt").write_bytes(described(b"\x80\x02}X\x01\x00\x00\x00aR."))
+    Path("model.pt").write_bytes(described(b"\x80\x02ctorch._utils\n_rebuild_tensor_v2\n)R."))
     message = refused_by_command(capfd, "rsl-rl", "model.pt")
     assert "is corrupt, or has more than tensors, numbers and text" in message
     assert "weights_only" not in message
@@ -672,3 +673,46 @@ def test_long_number_in_a_pickle_gives_no_advice_to_change_python(opcode, capfd)
     assert main(["import", "rsl-rl", "model.pt", "--task", "cartpole"]) == 5
     message = capfd.readouterr().err
     assert "model.pt is corrupt: it has a number of more than 4300 digits; save the file again" in message
+
+
+SHARED = b"N" + b"".join(b"q%ch%c\x86" % (i, i) for i in range(60))
+"""A tuple of two references to a tuple of two references ...: its hash takes 2^60 steps."""
+STORAGE = b"ctorch\nFloatStorage\n"
+COSTLY = {
+    "shared tuples as a key": (b"}" + SHARED + b"Ns.", "counted with repetitions"),
+    "shared lists": (b"]" + b"".join(b"q%c]h%cah%ca" % (i, i, i) for i in range(60)) + b".", "with repetitions"),
+    "nested tuples as a key": (b"}N" + b"\x85" * 1_000_000 + b"Ns.", "deeper than 100 levels"),
+    "nested lists": (b"]" * 200 + b"a" * 199 + b".", "deeper than 100 levels"),
+    "a list put into lists before they are filled": (b"]q\x00]q\x01h\x00ah\x00h\x01a.", "part of another"),
+    "a list in itself": (b"]q\x00h\x00a.", "part of another"),
+    "a tuple as a key": (b"}N\x85Ns.", "neither text nor a whole number"),
+    "a large number as a key": (b"}\x8a\x08" + b"\xff" * 7 + b"\x1fNs.", "neither text nor a whole number"),
+    "keys of an OrderedDict's arguments": (b"ccollections\nOrderedDict\n]]N\x85aNaa\x85R.", "calls something"),
+    "a storage of a wanted size": (STORAGE + b"\x8a\x05\x00\x00\x00\x00\x7f\x85R.", "calls something"),
+    "a storage with tuples as its name": (b"(X\x07\x00\x00\x00storage" + STORAGE + b"N\x85\x85NNtQ.", "no simple name"),
+    "attributes from a list": (b"ccollections\nOrderedDict\n)R]b.", "sets attributes"),
+}
+"""Pickle of plain values that takes very long or much memory to load, or crashes Python -> part of the error."""
+
+
+@pytest.mark.parametrize("form", ["sb3", "rsl-rl"])
+@pytest.mark.parametrize("name", COSTLY)
+def test_plain_values_that_are_costly_to_load_are_refused(name, form, good, capfd):
+    pickled, expected = COSTLY[name]
+    data = described(b"\x80\x02" + pickled)
+    Path("model.pt").write_bytes(data)
+    file = "model.pt" if form == "rsl-rl" else zipped({"policy.pth": data}, "bad.zip", like=good[1])
+    assert expected in refused_by_command(capfd, form, file)
+
+
+def test_nested_checkpoint_with_optimizer_and_shared_values_is_read():
+    """Adam's state has numbers as keys; `betas` is one tuple that two groups share."""
+    layers = torch.nn.ModuleList([torch.nn.Linear(4, 1), torch.nn.Linear(1, 1)])
+    optimizer = torch.optim.Adam([{"params": list(layer.parameters())} for layer in layers], lr=1e-3)
+    sum(layer.weight.sum() + layer.bias.sum() for layer in layers).backward()
+    optimizer.step()
+    saved = {"model_state_dict": layers.state_dict(), "optimizer_state_dict": optimizer.state_dict(), "infos": None}
+    found = read_tensors(saved_by_torch(saved), "model.pt")
+    assert found["optimizer_state_dict"]["param_groups"][1]["betas"] == (0.9, 0.999)
+    assert set(found["optimizer_state_dict"]["state"]) == {0, 1, 2, 3}
+    assert torch.equal(found["model_state_dict"]["0.weight"], layers[0].weight)

@@ -9,7 +9,7 @@ import pytest
 from rlcli.errors import CheckpointError
 from rlcli.runs import safe_io
 from rlcli.runs.checkpoint_reader import open_checkpoint
-from rlcli.runs.safe_io import check_json, parse_json, read_file, read_tail, refuse_links
+from rlcli.runs.safe_io import check_json, parse_json, read_file, read_tail, require_plain_entries
 from rlcli.safe_text import message_line
 
 
@@ -200,15 +200,15 @@ def test_parse_json_error_shortens_keys_and_numbers(file):
         assert len(caught.value.message) < len(str(file)) + 100
 
 
-def test_refuse_links_names_the_first_link(tmp_path):
+def test_require_plain_entries_names_the_first_link(tmp_path):
     (tmp_path / "plain").touch()
-    refuse_links(tmp_path)
+    require_plain_entries(tmp_path)
     for name in ("b", "a", "c"):
         (tmp_path / name).symlink_to(tmp_path / "plain")
     with pytest.raises(CheckpointError, match=r"/a is a link; replace it by the file itself"):
-        refuse_links(tmp_path)
+        require_plain_entries(tmp_path)
     with pytest.raises(CheckpointError, match=r"nowhere cannot be read: No such file"):
-        refuse_links(tmp_path / "nowhere")
+        require_plain_entries(tmp_path / "nowhere")
 
 
 @pytest.mark.parametrize(

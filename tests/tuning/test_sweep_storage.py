@@ -1,6 +1,7 @@
 """Trials of a sweep without training: claims of several processes, sampled values, and damaged storage."""
 
 import json
+import os
 import threading
 
 import pytest
@@ -184,6 +185,40 @@ def test_damaged_result_is_checkpoint_error(tmp_path, old, new):
         read_sweep(tmp_path).trials()
 
 
+def tree(folder):
+    """Path of each entry below a folder -> content of the file; None for folders."""
+    return {path: path.read_bytes() if path.is_file() else None for path in sorted(folder.rglob("*"))}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("trial-0001", "compare-default-seed-0", "trial-0000/checkpoints", "trial-0000/checkpoints/logs"),
+        *("trial-0000/train.log", "trial-0000/.worker", "study.json", "journal.log", "best.yaml", ".sweep"),
+    ],
+)
+@pytest.mark.parametrize("kind", ["link", "pipe"])
+def test_sweep_with_a_link_or_pipe_is_refused_and_nothing_is_written(tmp_path, name, kind, cli):
+    sweep, victim = tmp_path / "sweep", tmp_path / "victim"
+    finish(open_or_join(sweep), 1)
+    (victim / "checkpoints").mkdir(parents=True)
+    (victim / "config.yaml").write_text("kept")
+    entry = sweep / name
+    entry.parent.mkdir(exist_ok=True)
+    entry.unlink(missing_ok=True)
+    if kind == "link":
+        entry.symlink_to(victim if "." not in entry.name else victim / "config.yaml")
+    else:
+        os.mkfifo(entry)
+    before = tree(tmp_path)
+    for look in (open_or_join, read_sweep):
+        with pytest.raises(CheckpointError, match=f"{entry.name} is (a link|not a regular file)"):
+            look(sweep)
+    for words in (("show", sweep), ("compare", sweep)):
+        assert cli("sweep", *words).code == 5
+    assert tree(tmp_path) == before
+
+
 def test_missing_journal_is_checkpoint_error(tmp_path):
     finish(open_or_join(tmp_path), 2)
     (tmp_path / JOURNAL).unlink()
@@ -205,6 +240,54 @@ def test_task_from_other_folder_is_other_sweep(tmp_path):
     open_or_join(tmp_path, source={"name": "cartpole", "distribution": None, "folder": "/one"})
     with pytest.raises(UsageError, match="is a sweep with other settings"):
         open_or_join(tmp_path, source={"name": "cartpole", "distribution": None, "folder": "/two"})
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        *(("params", value) for value in ([{}], [[]], {}, "a", None, ["a"], ["agent.gamma=0.9:0.8"])),
+        *(("overrides", [1]), ("flags", []), ("source", {}), ("source", {"name": 1}), ("trials", "3"), ("seed", -1)),
+        *(("direction", "up"), ("pruner", 1), ("objective", "a\nb"), ("storage", {}), ("config", 1)),
+    ],
+)
+def test_wrong_type_in_study_file_is_checkpoint_error(tmp_path, key, value, cli):
+    open_or_join(tmp_path)
+    record = json.loads((tmp_path / "study.json").read_text())
+    (tmp_path / "study.json").write_text(json.dumps({**record, key: value}))
+    for form in ((), ("--json",)):
+        done = cli("sweep", "show", tmp_path, *form)
+        assert done.code == 5
+        assert f"study.json is corrupt: {key}" in (done.out if form else done.err)
+
+
+@pytest.mark.parametrize("value", [[[]], [], 1, "text", {"params": [[]]}])
+def test_wrong_type_of_the_settings_in_the_journal_is_checkpoint_error(tmp_path, value):
+    open_or_join(tmp_path)
+    journal = tmp_path / JOURNAL
+    entries = [json.loads(line) for line in journal.read_text().splitlines()]
+    entries[-1]["user_attr"] = {"rlcli": value}
+    journal.write_text("".join(json.dumps(entry) + "\n" for entry in entries))
+    with pytest.raises(CheckpointError, match=r"journal\.log is corrupt: rlcli"):
+        open_or_join(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "entry",
+    [
+        {"op_code": 7, "step": 1, "intermediate_value": "high"},
+        {"op_code": 5, "param_name": "agent.n_steps", "param_value_internal": 0, "distribution": "CHOICE"},
+        {"op_code": 5, "param_name": "agent.learning_rate", "param_value_internal": 0, "distribution": "CHOICE"},
+        {"op_code": 8, "user_attr": {"seconds": [1]}},
+    ],
+)
+def test_wrong_value_of_a_running_trial_is_checkpoint_error(tmp_path, entry):
+    open_or_join(tmp_path).study.ask()
+    choice = json.dumps({"name": "CategoricalDistribution", "attributes": {"choices": ["x", "y"]}})
+    entry = {"worker_id": "w", "trial_id": 0, **{k: choice if v == "CHOICE" else v for k, v in entry.items()}}
+    with (tmp_path / JOURNAL).open("a") as journal:
+        journal.write(json.dumps(entry) + "\n")
+    with pytest.raises(CheckpointError, match="is corrupt: trial 0"):
+        read_sweep(tmp_path).trials()
 
 
 @pytest.mark.parametrize("text", ["{", "[]", '{"kind": "sweep", "task": "cartpole"}', '{"kind": "seeds", "task": "a"}'])

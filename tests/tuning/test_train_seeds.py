@@ -66,6 +66,21 @@ def test_study_is_not_resumed_with_options_of_one_training(cli, words, message):
     assert (result.code, message in result.err) == (2, True)
 
 
+@pytest.mark.parametrize("name", ["seed-1", "seed-0/train.log", "seed-0/checkpoints"])
+@pytest.mark.parametrize("kind", ["link", "pipe"])
+def test_study_with_a_link_or_pipe_is_not_resumed(cli, name, kind):
+    study, victim = Path("runs/cartpole/s"), Path("victim")
+    (study / name).parent.mkdir(parents=True)
+    victim.mkdir()
+    record = {"kind": "seeds", "task": "cartpole", "seeds": [0, 1], "runs": ["seed-0", "seed-1"], "device": "cpu"}
+    (study / "study.json").write_text(json.dumps(record))
+    (study / name).symlink_to(victim.resolve()) if kind == "link" else os.mkfifo(study / name)
+    result = cli("train", "--resume", study)
+    assert result.code == 5, result.err
+    assert f"{name} is {'a link' if kind == 'link' else 'not a regular file'}" in result.err
+    assert not list(victim.iterdir())
+
+
 def test_seeds_are_not_trained_below_torchrun(cli, monkeypatch):
     monkeypatch.setenv("RANK", "0")
     monkeypatch.setenv("WORLD_SIZE", "2")

@@ -7,7 +7,7 @@ Python, become actuator models.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from rlcli_isaaclab.settings import Node, Report, as_float, kind_of, to_plain
@@ -17,7 +17,7 @@ _EXPLICIT = ("IdealPDActuator", "DCMotor", "DelayedPDActuator", "RemotizedPDActu
 _NETWORKS = ("ActuatorNetLSTM", "ActuatorNetMLP")
 
 JointSettings = list[tuple[str, dict[str, Any], list[str]]]
-"""List of (regular expression of joint names, settings, regular expressions of all joints of the actuator group).
+"""List of (regular expression of joint names, settings, joints of the actuator group that it matches).
 
 Later entries override earlier ones.
 """
@@ -26,6 +26,7 @@ Later entries override earlier ones.
 def read_actuators(
     actuators: Node,
     order_joints: Callable[[list[str], Node], Any],
+    joint_names: Sequence[str],
     entity: str,
     replaced: Mapping[str, Mapping[str, float]],
     own: dict[tuple[str, str], Mapping[str, Any]],
@@ -35,6 +36,7 @@ def read_actuators(
     Args:
         actuators: the groups of actuators, `actuators` of an `ArticulationCfg`.
         order_joints: function that returns the names or regular expressions of a group's joints in the model's order.
+        joint_names: the joints of the entity's model.
         entity: name of the entity, for messages.
         replaced: group -> gains of the PD controller that replaces its actuator network.
         own: filled with (entity, group) -> settings, for each group whose actuator class is the user's own.
@@ -48,6 +50,7 @@ def read_actuators(
             continue
         patterns = item.require("joint_names_expr") or [".*"]
         patterns = [patterns] if isinstance(patterns, str) else list(patterns)
+        in_group = item.report.matching(patterns, joint_names, item.key)
         passive = {
             "armature": item.get("armature"),
             "friction_loss": item.get("friction"),
@@ -97,10 +100,11 @@ def read_actuators(
             )
             continue
         for setting, value in settings.items():
-            if isinstance(value, Mapping):
-                joints += [(str(pattern), {setting: as_float(number)}, patterns) for pattern, number in value.items()]
-            elif value is not None:
-                joints += [(pattern, {setting: as_float(value)}, patterns) for pattern in patterns]
+            by_pattern = value if isinstance(value, Mapping) else dict.fromkeys(patterns, value)
+            for pattern, number in by_pattern.items():
+                if number is not None:
+                    matched = item.report.matching([pattern], in_group, (*item.key, setting))
+                    joints.append((pattern, {setting: as_float(number)}, matched))
     return joints, models
 
 
@@ -159,13 +163,10 @@ def _read_explicit_actuator(
 
 
 def settings_of(joint: str, settings: JointSettings) -> dict[str, Any]:
-    """Return the settings of one joint; later entries override earlier ones.
-
-    A regular expression matches only joints of its own actuator group.
-    """
+    """Return the settings of one joint; later entries override earlier ones."""
     found: dict[str, Any] = {}
-    for pattern, values, group in settings:
-        if re.fullmatch(pattern, joint) and any(re.fullmatch(other, joint) for other in group):
+    for _, values, joints in settings:
+        if joint in joints:
             found |= values
     return found
 
@@ -218,7 +219,7 @@ def _merge(
         report.entries["scene", name, "actuators", "damping"] = ("approximated", why)
     joints: dict[str, Any] = {}
     for pattern in dict.fromkeys([*(pattern for pattern, _, _ in settings), *map(re.escape, by_joint)]):
-        matched = [joint for joint in model["joint"] if re.fullmatch(pattern, joint)]
+        matched = report.matching([pattern], model["joint"], ("scene", name, "actuators"))
         if matched and all(j in by_joint and by_joint[j] == by_joint[matched[0]] for j in matched):
             if by_joint[matched[0]]:
                 joints[matched[0] if len(matched) == 1 else pattern] = by_joint[matched[0]]

@@ -14,6 +14,7 @@ from rlcli.errors import ConfigError, Problem
 from rlcli.formats import Note, Status
 from rlcli.machine.plain_files import read_plain
 from rlcli.rl.ppo.rl_games_file import WITHOUT_EFFECT, RlGamesReader
+from rlcli_isaaclab.dump_yaml import read
 from rlcli_isaaclab.settings import Node, Report
 
 
@@ -28,19 +29,13 @@ def read_agent(file: Path, library: str, notes: list[Note]) -> dict[str, Any] | 
     reader = next((read for name, read in _READERS.items() if library == name or library.startswith(f"{name}-")), None)
     if reader is None:
         return None
-    try:
-        text = read_plain(file, MAX_BYTES)
-        data = yaml.safe_load(text)
-    except (OSError, yaml.YAMLError, RecursionError) as error:
-        raise ConfigError([Problem(str(file), "", f"cannot be read: {' '.join(str(error).split())}")]) from None
-    if not isinstance(data, dict):
-        raise ConfigError([Problem(str(file), "", "the top level must be a mapping (key: value)")])
+    data = read(file)
     report = Report()
     try:
         config = reader(Node(_numbers(data), (), report))
         report.finish(data)
     except ConfigError as error:
-        tree = yaml.compose(text, yaml.SafeLoader)
+        tree = yaml.compose(read_plain(file, MAX_BYTES), yaml.SafeLoader)
         at = [f"{file}:{_line(tree, p.path)}" for p in error.problems]
         problems = zip(at, error.problems, strict=True)
         raise ConfigError([Problem(where, p.path, p.message, p.hint) for where, p in problems]) from None

@@ -8,51 +8,17 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from rlcli.config.dump import to_yaml
 from rlcli.config.load import check_all
 from rlcli.errors import ConfigError, Problem, UsageError
 from rlcli.formats import Imported, Note
-from rlcli.machine.plain_files import read_plain
 from rlcli.registry import folder_task, model_file
 from rlcli_isaaclab.config_class import to_dict
 from rlcli_isaaclab.convert import agent, task
+from rlcli_isaaclab.dump_yaml import read
 from rlcli_isaaclab.envs import ManagerBasedRLEnvCfg
 from rlcli_isaaclab.observation_sets import fit_groups
 from rlcli_isaaclab.settings import Report
-
-MAX_BYTES = 4 * 1024 * 1024
-MAX_VALUES = 100_000
-_PYTHON = "tag:yaml.org,2002:python/"
-
-
-def read(file: Path) -> dict[str, Any]:
-    """Read a YAML file of Isaac Lab, which may have Python's tuples and slices.
-
-    Functions and classes become text, `module:name`; other Python objects become None. No object is constructed.
-
-    Raises:
-        ConfigError: if the file cannot be read or is not such a dump.
-    """
-    try:
-        text = read_plain(file, MAX_BYTES)  # refuses pipes, which would block
-    except OSError as error:
-        raise ConfigError(
-            [Problem(str(file), "", f"cannot be read: {error.strerror or error}; check the path")]
-        ) from None
-    try:
-        data = yaml.load(text, Loader=_Loader)
-        _count(data)
-    except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark
-        position = f"{file}:{mark.line + 1}:{mark.column + 1}" if mark else str(file)
-        raise ConfigError([Problem(position, "", error.problem or "not YAML; correct it")]) from None
-    except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
-        raise ConfigError([Problem(str(file), "", str(error) or "nested too deeply; write flatter values")]) from None
-    if not isinstance(data, dict):
-        raise ConfigError([Problem(str(file), "", "the top level must be a mapping (key: value)")])
-    return data
 
 
 def convert(env: Path, agent_file: Path | None, folder: Path, models: Mapping[str, str]) -> Imported:
@@ -187,44 +153,3 @@ def _agent(file: Path, report: Report, data_of_task: Mapping[str, Any]) -> dict[
         if notes:
             report.entries[("obs_groups",)] = (notes[0].status, "; ".join(note.text for note in notes))
     return settings
-
-
-def _count(value: Any) -> None:
-    """Check the number of values: with aliases, a small YAML file can expand to a huge structure.
-
-    Raises:
-        ValueError: if there are more than MAX_VALUES.
-    """
-    left, stack = MAX_VALUES, [value]
-    while stack:
-        item = stack.pop()
-        left -= 1
-        if left < 0:
-            raise ValueError(f"the file has more than {MAX_VALUES} values; shorten it")
-        if isinstance(item, Mapping):
-            stack += item.values()
-        elif isinstance(item, list | tuple):
-            stack += item
-
-
-class _Loader(yaml.SafeLoader):
-    """PyYAML's safe loader, extended by tuples and slices."""
-
-
-def _tuple(loader: _Loader, node: yaml.SequenceNode) -> tuple[Any, ...]:
-    return tuple(loader.construct_sequence(node, deep=True))
-
-
-def _slice(loader: _Loader, node: yaml.SequenceNode) -> slice:
-    return slice(*loader.construct_sequence(node, deep=True))
-
-
-def _opaque(loader: _Loader, suffix: str, node: yaml.Node) -> Any:
-    """Return `module:name` for YAML's tag of a Python function or class; return None for the tag of another object."""
-    kind, _, name = suffix.partition(":")
-    return ":".join(name.rsplit(".", 1)) if kind == "name" else None
-
-
-_Loader.add_constructor(f"{_PYTHON}tuple", _tuple)
-_Loader.add_constructor(f"{_PYTHON}object/apply:builtins.slice", _slice)
-_Loader.add_multi_constructor(_PYTHON, _opaque)

@@ -8,12 +8,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import yaml
-
-from rlcli.config.strict_yaml import MAX_BYTES
+from rlcli.config.strict_yaml import MAX_BYTES, YamlError
 from rlcli.errors import TaskError
 from rlcli.machine.plain_files import read_plain
 from rlcli.registry.models import MODELS
+from rlcli_isaaclab.dump_yaml import parse
 
 MODEL_MAP = "models.yaml"
 """Name of the file that maps entities, or ends of USD paths, to MJCF files in the same folder."""
@@ -61,9 +60,13 @@ def given_models(root: Path, asked: Mapping[str, Any]) -> GivenModels:
         if not file.is_file():
             continue
         try:
-            content = yaml.safe_load(read_plain(file, MAX_BYTES)) or {}
-        except (OSError, yaml.YAMLError, RecursionError) as error:
-            raise TaskError(f"{file}: not YAML: {' '.join(str(error).split())}", hint="write NAME: FILE.xml") from None
+            content = parse(read_plain(file, MAX_BYTES)) or {}
+        except OSError as error:
+            raise TaskError(f"{file} cannot be read: {error.strerror or error}; check the path") from None
+        except YamlError as error:
+            raise TaskError(
+                f"{file}:{error.line}:{error.column}: not YAML: {error.message}", hint="write NAME: FILE.xml"
+            ) from None
         if not isinstance(content, Mapping):
             raise TaskError(f"{file}: expected lines NAME: FILE.xml", hint="for example robot: robot.xml")
         for name, value in content.items():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -40,9 +39,8 @@ class ObjectReader:
             command = driven_by(action) or next((w for w in ("effort", "velocity") if w in kind.lower()), "position")
             patterns = [".*"] if wanted is None and action else [wanted] if isinstance(wanted, str) else wanted
             for pattern in patterns if isinstance(patterns, list | tuple) else ():
-                for joint in self.scene.names(entity, "joint") or []:
-                    if re.fullmatch(pattern, joint):
-                        self.driven_joints.setdefault(entity, {})[joint] = command
+                for joint in self.report.matching([pattern], self.scene.names(entity, "joint") or [], item.key):
+                    self.driven_joints.setdefault(entity, {})[joint] = command
 
     def read_action(self, node: Node) -> dict[str, Any]:
         """Return the settings of an action term of rlcli."""

@@ -325,6 +325,7 @@ class SceneReader:
         self._joint_settings[name], explicit = read_actuators(
             item.node("actuators"),
             lambda patterns, group: self.order_names(name, "joint", patterns, False, group.key),
+            self.names(name, "joint") or [],
             name,
             self._given.gains.get(name, {}),
             self.user_actuators,
@@ -408,7 +409,7 @@ class SceneReader:
             if model is not None and not model["joint"]:
                 continue
             known = model["qpos"] if model is not None and key == "joint_pos" else {}
-            same = [self._has_value(name, pattern, value, known) for pattern, value in wanted.items()]
+            same = [self._has_value(init, name, pattern, value, known) for pattern, value in wanted.items()]
             if model is not None and all(same):
                 continue
             config[key] = wanted
@@ -421,9 +422,9 @@ class SceneReader:
             if any(value):
                 entity.setdefault("init", {})[key] = value
 
-    def _has_value(self, entity: str, pattern: str, value: float, known: Mapping[str, float]) -> bool:
+    def _has_value(self, init: Node, entity: str, pattern: str, value: float, known: Mapping[str, float]) -> bool:
         """Return whether a pattern matches joints, and all of them have the value in `known`, by joint name (or 0)."""
-        matched = [n for n in self.names(entity, "joint") or [] if re.fullmatch(pattern, n)]
+        matched = self.report.matching([pattern], self.names(entity, "joint") or [], init.key)
         return bool(matched) and all(known.get(n, 0.0) == value for n in matched)
 
     def _read_light(self, item: Node, spawn: Node, lights: dict[str, Any]) -> None:

@@ -6,7 +6,7 @@ A key that no reader has read is reported as ignored.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -41,7 +41,25 @@ class Report:
 
     def problem(self, key: Key, message: str, hint: str | None = None) -> None:
         """Record a mistake at a key; `finish` raises an error with all of them."""
-        self.problems.append(Problem("configuration", ".".join(key), message, hint))
+        self.problems.append(Problem("configuration", ".".join(map(str, key)), message, hint))
+
+    def matching(self, patterns: Any, names: Sequence[str], key: Key) -> list[str]:
+        """Return the joints that one of the names or regular expressions in a file matches, in the order of `names`.
+
+        A pattern that is no text, no regular expression, or takes long to compare, is recorded as a mistake.
+        """
+        from rlcli.scene.names import NameProblem, search
+
+        found: set[int] = set()
+        for pattern in [patterns] if isinstance(patterns, str) else patterns:
+            try:
+                if not isinstance(pattern, str):
+                    raise NameProblem(f"expected the name of a joint or a regular expression, found {pattern!r}")
+                found.update(search(pattern, names, "joint"))
+            except NameProblem as problem:
+                if str(problem) not in [known.message for known in self.problems]:
+                    self.problem(key, str(problem), problem.hint)
+        return [name for index, name in enumerate(names) if index in found]
 
     def finish(self, data: Any, defaults: Any = None) -> None:
         """Mark the keys that were never read as ignored, or as default if they have their default value.

@@ -13,6 +13,7 @@ from rlcli.config.dump import to_data
 from rlcli.config.load import resolve
 from rlcli.envs.make import make_env
 from rlcli.registry import find_task, folder_task
+from rlcli_isaaclab.dump_yaml import read
 
 torch.set_num_threads(1)
 HERE = Path(__file__).parent
@@ -175,8 +176,23 @@ BOMB = "a: &a [1, 2, 3, 4, 5, 6, 7, 8, 9]\n" + "".join(
         ("a: [", "env.yaml:"),
         ("- 1", "the top level must be a mapping"),
         ("a: 1", "missing 'decimation'"),
-        (BOMB, "more than"),
-        ("[" * 3000, "env.yaml"),
+        (BOMB, "env.yaml:5:12: the file has more than 20000 items"),
+        ("x: " + "[" * 3000, "env.yaml:1:36: values are nested deeper than 32 levels"),
+        ("x: &a [" + "[" * 20 + "1" + "]" * 20 + "]\ny: " + "[" * 20 + "*a", "env.yaml:2:24: values are nested deeper"),
+        ("x: &a [*a]", "env.yaml:1:8: the anchor 'a' contains itself"),
+        ("x: '" + "y" * 300_000 + "'", "env.yaml: cannot be read: the file is larger than 262144 bytes"),
+        ("x: '" + "y" * 20_000 + "'", "env.yaml:1:4: the value is longer than 16384 characters"),
+        ("x: 1\nx: 2", "env.yaml:2:1: duplicate key 'x'"),
+        ("x: &a {y: 1}\nz: {<<: *a}", "env.yaml:2:5: merge keys (<<) are not allowed"),
+        ("x: {[1]: 2}", "env.yaml:1:5: a key must be text"),
+        ("x: !!binary aGVsbG8=", "env.yaml:1:4: only tags of scalars and of Python objects are allowed"),
+        ("x: !!python/tuple 1", "env.yaml:1:4: the tag needs a list"),
+        ("x: !!python/object/apply:builtins.slice [1, 2, 3, 4]", "env.yaml:1:4: this value is not a valid builtins"),
+        ("x: " + "9" * 5000, "env.yaml:1:4: '" + "9" * 60 + "' is not a valid int"),
+        ("x: !!float a", "env.yaml:1:4: 'a' is not a valid float"),
+        ('x: "\\U00110000"', "is not a Unicode character; correct it"),
+        ('x: "\\ud800"', "env.yaml:1:4: half of a surrogate pair"),
+        ("x: 1\n--- {}", "env.yaml:2:1: "),
     ],
 )  # fmt: skip
 def test_invalid_file_is_refused(imported, text, message):
@@ -184,6 +200,20 @@ def test_invalid_file_is_refused(imported, text, message):
     assert code == 3
     assert message in json.dumps(document)
     assert not folder.exists()
+
+
+def test_dump_that_is_not_utf_8_is_refused(tmp_path, capsys):
+    (tmp_path / "env.yaml").write_bytes(ENV.read_text().encode("utf-16"))
+    assert main(["import", "isaaclab", str(tmp_path / "env.yaml"), "-o", str(tmp_path / "out")]) == 3
+    assert "env.yaml:1:1: not UTF-8" in capsys.readouterr().err
+
+
+def test_dump_of_python_objects_is_read_as_pyyaml_writes_it(tmp_path):
+    shared = (1, 2.5)
+    data = {"tuple": shared, "again": shared, "slice": slice(None), "function": os.path.join, "y": {"on": [None, True]}}
+    (tmp_path / "env.yaml").write_text(yaml.dump(data) + ".nan: 1\n5: 2020-01-01\n")
+    expected = {**data, "function": "posixpath:join", ".nan": 1, "5": "2020-01-01"}
+    assert read(tmp_path / "env.yaml") == expected
 
 
 def test_existing_task_is_not_overwritten(imported):
@@ -239,3 +269,32 @@ def test_pipe_and_endless_file_are_not_read(tmp_path, capsys):
         assert main(["import", "isaaclab", str(file), "-o", str(tmp_path / "out")]) == 3
         assert why in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("pattern", "message"),
+    [
+        ("x[31m", "neither the name of a joint nor a regular expression"),
+        ("(([a-z_]*)*)*X", "can take exponential time"),
+        ("slider" + ".*" * 30, "the pattern"),
+    ],
+)
+@pytest.mark.parametrize("place", ["actions", "actuators", "init", "gains"])
+def test_pattern_that_is_invalid_or_hangs_is_refused(imported, place, pattern, message):
+    data = read(ENV)
+    robot = data["scene"]["robot"]
+    group = robot["actuators"]["cart_actuator"]
+    if place == "actions":
+        data["actions"]["joint_effort"]["joint_names"] = [pattern]
+    elif place == "init":
+        robot["init_state"]["joint_pos"] = {pattern: 0.0}
+    elif place == "gains":
+        group["damping"] = {pattern: 1.0}
+    else:
+        group["joint_names_expr"] = [pattern, 5]
+    code, document, _, folder = imported(yaml.dump(data))
+    assert code == 3
+    messages = [problem["message"] for problem in document["error"]["problems"]]
+    assert len([text for text in messages if message in text]) == 1, messages
+    assert any("found 5" in text for text in messages) == (place == "actuators")
+    assert not folder.exists()

@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from rlcli.scene.names import match
+from rlcli.scene.names import match, search
 
 
 def to_camel_case(snake_str: str, to: str = "cC") -> str:
@@ -46,7 +46,7 @@ def resolve_matching_names_values(
     names, found = list(list_of_strings), {}
     key_of: dict[int, str] = {}
     for pattern, value in data.items():
-        matched = [index for index, name in enumerate(names) if re.fullmatch(pattern, name)]
+        matched = search(pattern, names, "name")
         if not matched:
             raise ValueError(f"no name matches '{pattern}'; names: {', '.join(names)}")
         for index in matched:
