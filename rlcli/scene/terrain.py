@@ -85,8 +85,8 @@ def terrain_problems(config: TerrainConfig, root: Path) -> Iterator[TerrainProbl
         edge = min(config.patch) - 2.0 * round(patch.border / config.resolution) * config.resolution
         if edge < 2.0 * config.resolution - 1e-6:
             where = ("sub_terrains", name, "border")
-            message = f"a border of {patch.border:g} m covers the whole patch"
-            yield where, message, f"set less than {min(config.patch) / 2:g}"
+            message = f"a border of {patch.border:g} m leaves less than two cells of the patch"
+            yield where, message, f"set at most {min(config.patch) / 2 - config.resolution:g}"
             continue
         for key, text, advice in _patch_problems(patch, edge, config.resolution):
             yield ("sub_terrains", name, key), text, advice

@@ -456,7 +456,11 @@ def test_origins_without_terrain_are_0(tmp_path):
     [
         ({"kind": "hills"}, "terrain.kind: expected 'generator' or 'heights', found 'hills'", None),
         ({"sub_terrains": {}}, "terrain.sub_terrains: expected at least 1 item", None),
-        ({"sub_terrains": {"a": {"kind": "noise", "proportion": 0.0}}}, "sub_terrains: the proportions", "above 0"),
+        (
+            {"sub_terrains": {"a": {"kind": "noise", "proportion": 0.0}}},
+            "sub_terrains: the `proportion` of every sub-terrain is 0",
+            "above 0",
+        ),
         ({"sub_terrains": {"a": {"kind": "noise", "proportion": -1.0}}}, "a.proportion: expected a number >= 0", None),
         ({"sub_terrains": {"a": {"kind": "stair"}}}, "sub_terrains.a.kind: expected 'flat'", "did you mean 'stairs'"),
         ({"sub_terrains": {"a": {"height": [0, 1]}}}, "sub_terrains.a: missing key 'kind'", "stairs"),
@@ -467,7 +471,11 @@ def test_origins_without_terrain_are_0(tmp_path):
             "a.step_width: a step of 0.1 m needs",
             "boxes: true",
         ),
-        ({"sub_terrains": {"a": {"kind": "noise", "border": 1.95}}}, "a.border: a border of 1.95 m leaves", "than 2"),
+        (
+            {"sub_terrains": {"a": {"kind": "noise", "border": 1.95}}},
+            "a.border: a border of 1.95 m leaves less than two cells",
+            "at most 1.9",
+        ),
         ({"sub_terrains": {"a": {"kind": "grid", "cell": 0.1}}}, "a.cell: a cell of 0.1 m needs", "boxes: true"),
         (
             {"sub_terrains": {"a": {"kind": "stones", "width": [0.5, 5.0]}}},
