@@ -152,7 +152,7 @@ def _opaque(_loader: _Loader, suffix: str, _node: yaml.Node) -> Any:
     return ":".join(name.rsplit(".", 1)) if kind == "name" else None
 
 
-_Loader.add_constructor("tag:yaml.org,2002:timestamp", _Loader.construct_yaml_str)  # type: ignore[no-untyped-call]
+_Loader.add_constructor("tag:yaml.org,2002:timestamp", _Loader.construct_yaml_str)
 _Loader.add_constructor(f"{_PYTHON}tuple", _sequence(tuple))
 _Loader.add_constructor(f"{_PYTHON}object/apply:builtins.slice", _sequence(lambda items: slice(*items)))
 _Loader.add_multi_constructor(_PYTHON, _opaque)

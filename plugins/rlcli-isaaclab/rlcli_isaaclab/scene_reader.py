@@ -11,6 +11,7 @@ from rlcli.errors import ConfigError, TaskError, did_you_mean, listing
 from rlcli_isaaclab.absent import AbsentValue, reason_of
 from rlcli_isaaclab.actuator_reader import JointSettings, add_joint_settings, read_actuators, settings_of
 from rlcli_isaaclab.collection import entity_name
+from rlcli_isaaclab.light_reader import read_light
 from rlcli_isaaclab.model_lookup import given_models, is_end_of, mjcf_of, model_hint
 from rlcli_isaaclab.sensor_reader import camera_kinds, filter_name, image_name, read_filters, read_sensor
 from rlcli_isaaclab.settings import Key, Node, Report, as_float, kind_of
@@ -76,7 +77,7 @@ class SceneReader:
             elif spawn_function == "spawn_ground_plane" and spawn:
                 ground = read_ground(item, spawn)
             elif spawn_function == "spawn_light" and spawn:
-                self._read_light(item, spawn, lights)
+                read_light(self.report, item, spawn, lights)
                 self.frames[name] = None
             elif spawn:
                 self._read_entity(name, item, spawn)
@@ -427,27 +428,6 @@ class SceneReader:
         matched = self.report.matching([pattern], self.names(entity, "joint") or [], init.key)
         return bool(matched) and all(known.get(n, 0.0) == value for n in matched)
 
-    def _read_light(self, item: Node, spawn: Node, lights: dict[str, Any]) -> None:
-        item.skip("prim_path", "collision_group", "debug_vis", "class_type")
-        spawn.skip("func", "prim_type", "visible", "semantic_tags", "copy_from_source", "normalize", "exposure")
-        spawn.skip("enable_color_temperature", "color_temperature", "texture_format", "visible_in_primary_ray", "angle")
-        kind = {"DomeLight": "dome", "DistantLight": "distant"}.get(str(spawn.data.get("prim_type")))
-        if kind is None:
-            self.report.entries[item.key] = ("ignored", "only dome and distant lights have a counterpart")
-            return
-        config = {
-            "color": [as_float(v) for v in spawn.get("color", (1.0, 1.0, 1.0))],
-            "intensity": as_float(spawn.get("intensity", 1000.0)),
-        }
-        rotation = [as_float(v) for v in item.node("init_state").get("rot", (1.0, 0.0, 0.0, 0.0))]
-        if kind == "distant":
-            config["direction"] = _direction_of(rotation)
-        item.node("init_state").skip("pos", "rot")
-        if kind in lights:
-            self.report.entries[item.key] = ("ignored", f"a scene has one {kind} light, and another light is used")
-            return
-        lights[kind] = config
-
 
 _SHAPES = {
     "spawn_cuboid": "box",
@@ -456,9 +436,3 @@ _SHAPES = {
     "spawn_capsule": "capsule",
 }
 """Isaac Lab's spawn function -> rlcli's shape."""
-
-
-def _direction_of(quat: list[float]) -> list[float]:
-    """Return the direction of a distant light: (0, 0, -1) rotated by a quaternion (w, x, y, z)."""
-    w, x, y, z = quat
-    return [-2.0 * (x * z + w * y), -2.0 * (y * z - w * x), -(1.0 - 2.0 * (x * x + y * y))]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import copy
 import inspect
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -12,8 +10,9 @@ from rlcli.config.term_signatures import Signature, SignatureError, builtin_term
 from rlcli.errors import ConfigError, Problem, did_you_mean, listing
 from rlcli_isaaclab import command_terms
 from rlcli_isaaclab.absent import AbsentValue, reason_of
+from rlcli_isaaclab.changed_setting_reader import read_changed_setting
 from rlcli_isaaclab.config_class import is_missing
-from rlcli_isaaclab.curricula import ChangedSetting, modify_env_param
+from rlcli_isaaclab.curricula import modify_env_param
 from rlcli_isaaclab.lab_terms import LAB_TERMS, command_resample
 from rlcli_isaaclab.managers import CommandTerm
 from rlcli_isaaclab.mdp import MdpFunction
@@ -183,7 +182,7 @@ class TermReader(ObjectReader):
         if name == "modify_reward_weight":
             return self._read_reward_stage(params)
         if isinstance(function, type) and issubclass(function, modify_env_param):
-            return self._read_changed_setting(function, node, params)
+            return read_changed_setting(self, function, node, params)
         special = LAB_TERMS.get(name or "")
         if special is not None and not isinstance(function, str) and special.needed(params.data):
             return self._read_user_term(section, special.function, None, node, params)
@@ -211,50 +210,6 @@ class TermReader(ObjectReader):
         else:
             config = self._read_user_term(section, function, name, node, params)
         return config
-
-    def _read_changed_setting(self, function: type, node: Node, params: Node) -> dict[str, Any]:
-        """Return a curriculum term that changes a setting during training with the user's function.
-
-        `function` is Isaac Lab's class `modify_env_param`, or a subclass.
-        """
-        from rlcli_isaaclab.terms import SettingTerm
-
-        address = str(params.require("address"))
-        values = {key: params.get(key) for key in ("modify_fn", "modify_params")}
-        setting = None
-        with contextlib.suppress(KeyError, AttributeError, TypeError, IndexError, ValueError):
-            setting = ChangedSetting(self.data, address, self._read_again)
-        if setting is None or not (setting.addresses or setting.is_own):
-            hint = "use the address of a number: SECTION.TERM.params.KEY, rewards.TERM.weight, commands.TERM.ranges.KEY"
-            what = f"the address '{address}' names no setting that rlcli can change during training"
-            self.report.problem((*params.key, "address"), what, hint)
-            return {"func": "stages", "address": "", "steps": [], "values": []}
-        return {"func": SettingTerm(function, setting, values, self.context), **dict(setting.addresses)}
-
-    def _read_again(
-        self, section: str, term: list[str], settings: Mapping[str, Any]
-    ) -> Iterator[tuple[str, dict[str, Any]]]:
-        """Translate one term of Isaac Lab again, with changed settings.
-
-        Args:
-            section: section of the term.
-            term: name of the term; for an observation, names of the group and the term.
-            settings: the changed settings.
-
-        Yields:
-            Address (such as `rewards.alive`) and settings of each term of rlcli that replaces the term.
-        """
-        reader = copy.copy(self)
-        reader.report, reader.stubs = Report(), {}
-        node = Node(settings, (section, *term), reader.report)
-        if section in ("commands", "actions"):
-            read = reader.read_command if section == "commands" else reader.read_action
-            yield f"{section}.{term[0]}", read(node)
-        elif section == "observations":
-            yield ".".join((section, *term)), reader.read_term(section, node)
-        else:
-            for name, config in reader.read_terms(section, term[0], node):
-                yield f"{section}.{name}", config
 
     def _find_builtin(self, section: str, name: str | None) -> tuple[str | None, Entry]:
         """Return rlcli's name of one of Isaac Lab's terms, and its entry in `table.py`.

@@ -75,8 +75,7 @@ class UserTerm:
         function: the user's function or class.
         section: section of the configuration, such as `rewards`.
         entities: names of the parameters that are a `SceneEntityCfg`.
-        extra: names of all parameters that the configuration sets. Those that the function does not declare are passed
-            to its `**kwargs`.
+        extra: names of all parameters that the configuration sets; those not declared go to `**kwargs`.
         objects: values of parameters that a YAML file cannot hold, such as functions.
         context: parts of the configuration that the function may read from the environment.
     """
@@ -193,7 +192,7 @@ class SettingTerm:
     Args:
         function: class of the term, `modify_env_param` or a subclass.
         setting: the setting that changes, a `ChangedSetting`.
-        params: parameters of the term, such as the user's function; a YAML file cannot hold them.
+        params: parameters that a YAML file cannot hold, such as the user's function.
         context: the user's configuration.
     """
 
@@ -408,10 +407,7 @@ def _set_members(target: Any, values: Mapping[str, Any]) -> None:
 
 
 def _to_namespace(value: Any) -> Any:
-    """Return a dict as an object whose attributes are the keys; nested dicts too.
-
-    Return other values, and dicts with a key that is not an identifier, unchanged.
-    """
+    """Return a dict, nested ones too, as an object with its keys as attributes; other values unchanged."""
     if isinstance(value, dict) and all(str(key).isidentifier() for key in value):
         return SimpleNamespace(**{key: _to_namespace(item) for key, item in value.items()})
     return value

@@ -1,7 +1,4 @@
-"""Stage and prims (USD's words for a scene and its objects) with which a task builds its scene.
-
-Each robot, object and shape becomes an entity of rlcli's scene.
-"""
+"""USD's stage and prims, with which a task builds its scene: robots, objects and shapes become rlcli's entities."""
 
 from __future__ import annotations
 
@@ -429,10 +426,7 @@ def define_prim(prim_path: str, prim_type: str = "Xform", **kwargs: Any) -> Prim
 
 
 def add_reference_to_stage(usd_path: str, prim_path: str, prim_type: str = "Xform") -> Prim:
-    """Record that a prim refers to a USD file, and return the prim; `prim_type` has no effect.
-
-    The model is loaded when the task creates a robot or object at the path of the prim.
-    """
+    """Record a prim's USD file, which is loaded when a robot or object is created at its path; return the prim."""
     stage = get_current_stage()
     stage.references[str(prim_path)] = str(usd_path)
     return Prim(stage, str(prim_path))
