@@ -21,7 +21,7 @@ from rlcli.config.strict_yaml import load
 from rlcli.errors import TaskError, UsageError, listing, require_known
 from rlcli.scaffold_mjcf import Robot, round3
 from rlcli.scaffold_mjcf_copy import SCALAR
-from rlcli.scene.mjcf_scan import BadModel
+from rlcli.scene.mjcf_safety_check import BadModel
 from rlcli.scene.untrusted_mjcf import read_mjcf
 
 _TEMPLATES = Path(__file__).parent / "templates" / "robot_tasks"

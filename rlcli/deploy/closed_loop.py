@@ -39,7 +39,7 @@ from rlcli.rl.action_functions import trained_policy
 from rlcli.rl.policy import Policy
 from rlcli.rl.rng import seed_generators
 from rlcli.runs.checkpoint_reader import Checkpoint
-from rlcli.runs.policy_interface import deployment_differences
+from rlcli.runs.layout_and_deployment import deployment_differences
 from rlcli.runs.policy_ref import Choice
 from rlcli.runs.restore import require_fit
 

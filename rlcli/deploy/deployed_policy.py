@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from rlcli.rl.policy import Policy
-from rlcli.runs.policy_interface import ActionColumns
+from rlcli.runs.layout_and_deployment import ActionColumns
 
 
 class DeployedPolicy(nn.Module):

@@ -24,7 +24,7 @@ from rlcli.errors import MachineError, UsageError, VerdictError, require_known
 from rlcli.rl.policy import PolicySpec
 from rlcli.runs.atomic_io import remove_leftovers, require_writable, sync_folder, write_synced
 from rlcli.runs.checkpoint_reader import Checkpoint
-from rlcli.runs.policy_interface import deployment_of, layout_of
+from rlcli.runs.layout_and_deployment import deployment_of, layout_of
 
 __all__ = ["BUNDLE", "FORMATS", "TOLERANCE", "Exported", "check_target", "export", "require_self_contained"]
 

@@ -5,7 +5,7 @@ from typing import Any
 
 from rlcli.deploy.deployed_policy import DeployedPolicy
 from rlcli.runs.checkpoint_reader import Checkpoint
-from rlcli.runs.policy_interface import ActionColumns, DeploymentRecord, LayoutRecord, ObservationColumns
+from rlcli.runs.layout_and_deployment import ActionColumns, DeploymentRecord, LayoutRecord, ObservationColumns
 from rlcli.runs.run import RECORD
 
 SCHEMA = 2

@@ -11,7 +11,7 @@ from importlib.machinery import ModuleSpec
 from pathlib import Path
 from typing import Any
 
-from rlcli.registry.module_aliases import (
+from rlcli.registry.framework_imports import (
     TaskFileLoader,
     files_below,
     import_by_name,

@@ -11,7 +11,7 @@ from markupsafe import Markup, escape
 
 from rlcli import __version__
 from rlcli.config.schema import bound_text
-from rlcli.reporting.run_page import Page
+from rlcli.reporting.run_page_content import Page
 from rlcli.safe_text import UNSAFE, shorten
 
 CONTENT_SECURITY_POLICY = (

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from rlcli.errors import CheckpointError, RlcliError
 from rlcli.evaluation import session as sessions
-from rlcli.reporting.run_page import Page, reason_of
+from rlcli.reporting.run_page_content import Page, reason_of
 from rlcli.runs.eval_store import read_evaluation
 from rlcli.runs.run import Run, require_own
 from rlcli.runs.safe_io import read_errors, read_file, require_inside

@@ -17,7 +17,7 @@ from pydantic import Field
 from rlcli.errors import CheckpointError, UsageError, VerdictError
 from rlcli.runs.atomic_io import disk_errors, remove_leftovers, sync_folder, to_json, write_synced
 from rlcli.runs.checkpoint_reader import FORMAT, Checkpoint, open_checkpoint, sha256
-from rlcli.runs.policy_interface import layout_of
+from rlcli.runs.layout_and_deployment import layout_of
 from rlcli.runs.run import Run, TaskRecord
 from rlcli.runs.safe_io import JSON_LIMIT, FileModel, PrintableText, check_json, parse_json, read_file
 from rlcli.runs.tensor_bytes import tensor_bytes

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from rlcli.scene.efforts_before_limits import JointEfforts
 from rlcli.scene.initial_state import default_joint_state, default_root_state, joint_speed_limits
-from rlcli.scene.joint_efforts import JointEfforts
 from rlcli.sim.acceleration_fields import computes_body_forces
 from rlcli.sim.column_views import MAX_CACHED_VIEWS, CachedViews, as_index, evenly_spaced, id_tensor
 from rlcli.sim.env_selection import ALL, Columns, Field, Selection

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rlcli.config.schema import EntityConfig
 from rlcli.errors import MissingModelError, TaskError, one_line
 from rlcli.registry.models import existing_model_file
-from rlcli.scene.mjcf_scan import BadModel
+from rlcli.scene.mjcf_safety_check import BadModel
 from rlcli.scene.names import SceneProblem
 from rlcli.scene.untrusted_mjcf import CheckedModel, ModelsTogether, check_mjcf, model_roots, open_mjcf
 

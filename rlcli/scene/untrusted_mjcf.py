@@ -1,10 +1,10 @@
 """Reader of untrusted MJCF, with limits on the files that a model may open and on its memory and compile time.
 
-The text is parsed (`mjcf_scan`) before MuJoCo reads it. Files that a model includes or loads must lie in the folders
-that its task may read, after links are resolved. The elements that take compile time are counted. Expensive models of
-a scene are first compiled together in a subprocess with limits on memory and time; above a second threshold they are
-refused. All ordinary robots are below the first threshold and are compiled at once: parsing takes milliseconds, a
-subprocess half a second.
+The text is parsed (`mjcf_safety_check`) before MuJoCo reads it. Files that a model includes or loads must lie in the
+folders that its task may read, after links are resolved. The elements that take compile time are counted. Expensive
+models of a scene are first compiled together in a subprocess with limits on memory and time; above a second threshold
+they are refused. All ordinary robots are below the first threshold and are compiled at once: parsing takes
+milliseconds, a subprocess half a second.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from rlcli.machine.processes import python_command
 from rlcli.registry import chosen_model, model_file
 from rlcli.safe_text import shorten
 from rlcli.scene.mjcf_cost import ModelCost
-from rlcli.scene.mjcf_scan import MAX_COST, MAX_MEMORY, BadModel, MjcfScan
+from rlcli.scene.mjcf_safety_check import MAX_COST, MAX_MEMORY, BadModel, MjcfScan
 from rlcli.sim.quiet_mujoco import quiet_mujoco
 
 SUBPROCESS_COST = 5_000

@@ -16,7 +16,7 @@ import torch
 from rlcli.errors import ConfigError, DependencyError, DeviceError, MachineError, ShapeError, TaskError, require_known
 from rlcli.progress import tracked
 from rlcli.runs.atomic_io import write_atomic
-from rlcli.testing import episode_checks, equivalence_checks, step_and_file_checks
+from rlcli.testing import episode_checks, same_result_checks, step_and_file_checks
 from rlcli.testing.findings import Finding, NotRunError, task_error_text
 from rlcli.testing.task_under_test import NUM_ENVS, TaskUnderTest, open_task
 
@@ -26,7 +26,7 @@ OnCheck = Callable[[str, "list[Finding] | None"], None]
 OnNote = Callable[[str, str], None]
 """Function that receives the name of a check and a text that is no finding, such as a measured speed."""
 
-_files, _episodes, _equivalence = step_and_file_checks, episode_checks, equivalence_checks
+_files, _episodes, _equivalence = step_and_file_checks, episode_checks, same_result_checks
 _IN_ORDER: tuple[Check, ...] = (
     *(_files.names, _files.yaml_round_trip, _files.finite, _files.shapes, _files.dtypes),
     *(_files.random_actions, _files.extreme_actions, _episodes.same_seed, _episodes.start_states),
@@ -117,7 +117,7 @@ def record_layout(
         TaskError: if there is no such task, or it cannot be imported.
     """
     subject = open_task(task, agent, overrides, config, NUM_ENVS, 0)
-    record, file = subject.env().layout.record(), equivalence_checks.layout_file(subject)
+    record, file = subject.env().layout.record(), same_result_checks.layout_file(subject)
     columns = {part: record[part] for part in ("observations", "actions")}
     return write_atomic(file, json.dumps(columns, indent=1) + "\n")  # a link at this path is replaced, not followed
 

@@ -20,8 +20,8 @@ from rlcli.runs.safe_io import read_file
 from rlcli.training.loggers import read_metrics
 from rlcli.training.signals import StopRequest
 from rlcli.training.start_run import TrainingRequest, prepare_run
-from rlcli.training.subprocesses import POLL_S, start_training
 from rlcli.training.time_to_threshold import Threshold, TimeToThreshold, median, read_threshold, time_to_threshold
+from rlcli.training.train_commands import POLL_S, start_training
 from rlcli.tuning.sweep import Sweep
 
 _log = logging.getLogger(__name__)

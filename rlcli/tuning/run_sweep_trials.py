@@ -16,8 +16,8 @@ from rlcli.runs.overview import newest_rows, overview
 from rlcli.runs.run import Run, open_run
 from rlcli.training.signals import StopRequest
 from rlcli.training.start_run import TrainingRequest, prepare_run
-from rlcli.training.subprocesses import POLL_S, TrainingProcess, start_command, start_training
 from rlcli.training.time_to_threshold import training_s
+from rlcli.training.train_commands import POLL_S, TrainingProcess, start_command, start_training
 from rlcli.tuning.search_space import Objective, Parameter
 from rlcli.tuning.sweep import Sweep, Trial
 

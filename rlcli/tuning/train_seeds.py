@@ -19,7 +19,7 @@ from rlcli.runs.run import open_run
 from rlcli.runs.study import create_study, read_study, runs_of
 from rlcli.training.signals import StopRequest
 from rlcli.training.start_run import TrainingRequest, run_record
-from rlcli.training.subprocesses import train_all
+from rlcli.training.train_commands import train_all
 
 _log = logging.getLogger(__name__)
 

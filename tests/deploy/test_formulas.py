@@ -16,8 +16,8 @@ from rlcli.deploy.deployed.run_policy import OPS, Controller
 from rlcli.deploy.env_description import describe
 from rlcli.envs.make import make_env
 from rlcli.registry import folder_task
-from rlcli.runs.policy_interface import OPS as KNOWN
-from rlcli.runs.policy_interface import DeploymentRecord, check_formula
+from rlcli.runs.layout_and_deployment import OPS as KNOWN
+from rlcli.runs.layout_and_deployment import DeploymentRecord, check_formula
 
 WALKER = """
 <mujoco>

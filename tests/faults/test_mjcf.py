@@ -17,7 +17,7 @@ from rlcli.envs.make import make_env
 from rlcli.errors import ConfigError
 from rlcli.registry import folder_task
 from rlcli.scene import untrusted_mjcf
-from rlcli.scene.mjcf_scan import BadModel, MjcfScan
+from rlcli.scene.mjcf_safety_check import BadModel, MjcfScan
 from rlcli.scene.untrusted_mjcf import check_mjcf, read_mjcf
 
 TASK = """

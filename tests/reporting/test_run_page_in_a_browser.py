@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from support.written_runs import learning, write_run
-from test_run_page import ATTACK
+from test_run_page_content import ATTACK
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 

@@ -16,7 +16,7 @@ from xml.etree import ElementTree
 import mujoco
 
 from rlcli.errors import Problem, one_line
-from rlcli.scene.mjcf_scan import BadModel
+from rlcli.scene.mjcf_safety_check import BadModel
 from rlcli.scene.untrusted_mjcf import read_mjcf
 
 RICH = """

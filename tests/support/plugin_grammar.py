@@ -16,7 +16,7 @@ import time
 from pathlib import Path
 
 from rlcli.cli.app import main
-from rlcli.registry import formats, module_aliases
+from rlcli.registry import formats, framework_imports
 from support.case_runs import run_cases
 
 SECONDS = 10
@@ -338,7 +338,7 @@ def run(seed, folder):
     draw = random.Random(seed)
     words = write(draw, folder, seed)
     site = str(folder / "site")
-    for cache in (formats._framework_packages, formats.aliasing_formats, module_aliases._formats_for):
+    for cache in (formats._framework_packages, formats.aliasing_formats, framework_imports._formats_for):
         cache.cache_clear()
     import rlcli.cli.commands
 

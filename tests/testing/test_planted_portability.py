@@ -9,7 +9,7 @@ import pytest
 
 from rlcli.cli.app import main
 from rlcli.registry import find_task
-from rlcli.testing import check_task, equivalence_checks, record_layout
+from rlcli.testing import check_task, record_layout, same_result_checks
 from rlcli.testing.task_under_test import TaskUnderTest
 
 
@@ -408,7 +408,7 @@ def edit_manifest(folder, change):
 
 
 def test_policy_accepts_fitting_shipped_policy(shipped):
-    assert list(equivalence_checks.policy(TaskUnderTest(shipped[0]))) == []
+    assert list(same_result_checks.policy(TaskUnderTest(shipped[0]))) == []
 
 
 @pytest.mark.parametrize(
@@ -424,7 +424,7 @@ def test_policy_accepts_fitting_shipped_policy(shipped):
 def test_policy_finds_misfit_of_shipped_policy(shipped, change, message):
     source, folder = shipped
     edit_manifest(folder, change)
-    (finding,) = equivalence_checks.policy(TaskUnderTest(source))
+    (finding,) = same_result_checks.policy(TaskUnderTest(source))
     assert finding.severity == "error"
     assert message in finding.message
 

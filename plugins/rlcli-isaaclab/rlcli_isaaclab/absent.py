@@ -10,7 +10,7 @@ from types import ModuleType
 from typing import Any
 
 from rlcli.errors import TaskError, pip_install
-from rlcli.registry.module_aliases import TaskFileLoader
+from rlcli.registry.framework_imports import TaskFileLoader
 from rlcli_isaaclab.format import LIBRARIES, TRAINERS
 
 _REASONS = {

@@ -19,7 +19,7 @@ from types import ModuleType
 from typing import Any
 
 from rlcli.errors import did_you_mean
-from rlcli.registry.module_aliases import import_package, is_task_package
+from rlcli.registry.framework_imports import import_package, is_task_package
 from rlcli.registry.task_imports import import_from
 from rlcli_isaaclab.absent import (
     AbsentValue,

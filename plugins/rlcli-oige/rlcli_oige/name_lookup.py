@@ -11,7 +11,7 @@ from typing import Any
 
 from rlcli.errors import did_you_mean
 from rlcli.registry import load_module
-from rlcli.registry.module_aliases import TaskFileLoader
+from rlcli.registry.framework_imports import TaskFileLoader
 from rlcli_oige.task_class import parse_file
 from rlcli_oige.task_yaml import is_oige_file
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from rlcli.config.schema import EntityConfig
 from rlcli.errors import ConfigError, Problem, TaskError, did_you_mean, listing
-from rlcli.scene.mjcf_scan import BadModel
+from rlcli.scene.mjcf_safety_check import BadModel
 from rlcli.scene.scene import Scene
 from rlcli.scene.untrusted_mjcf import package_roots, read_mjcf
 from rlcli_oige.model_edits import add_force_sensors, apply_schemas, apply_settings

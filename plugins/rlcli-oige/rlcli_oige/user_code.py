@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from rlcli.errors import TaskError
-from rlcli.registry.module_aliases import TaskFileLoader
+from rlcli.registry.framework_imports import TaskFileLoader
 
 
 def user_file() -> tuple[Path, int] | None:

@@ -13,7 +13,7 @@ from rlcli.cli.ui.options import RunsDir, check_output
 from rlcli.errors import CheckpointError
 
 if TYPE_CHECKING:
-    from rlcli.reporting.run_page import Page
+    from rlcli.reporting.run_page_content import Page
     from rlcli.runs.run import Run
 
 _FILE = "report.html"
@@ -49,7 +49,7 @@ def command(
         require_own(found, _FILE)
 
     from rlcli.reporting.html import render
-    from rlcli.reporting.run_page import gather_page
+    from rlcli.reporting.run_page_content import gather_page
     from rlcli.runs.atomic_io import write_atomic
 
     page = gather_page(found, checkpoint)

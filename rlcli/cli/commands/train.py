@@ -80,7 +80,7 @@ def command(
     from rlcli.runs.run_ref import default_runs_dir
     from rlcli.training.signals import StopRequest
     from rlcli.training.start_run import TrainingRequest, process_device
-    from rlcli.training.subprocesses import stop_with_parent
+    from rlcli.training.train_commands import stop_with_parent
 
     stop_with_parent()
     limit_openmp_spinning()

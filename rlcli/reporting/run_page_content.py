@@ -136,7 +136,7 @@ def _card(run: Run, document: strict_yaml.Document | None, checkpoint: Path | No
 
 
 def _layout(checkpoint: Path | None) -> dict[str, Any] | None:
-    from rlcli.runs.policy_interface import LayoutRecord
+    from rlcli.runs.layout_and_deployment import LayoutRecord
 
     if checkpoint is not None:
         with contextlib.suppress(CheckpointError, ValidationError):
