@@ -51,7 +51,7 @@ LIGHT = [
     "training/signals.py",
     *(f"rl/{name}/config.py" for name in TRAINERS),
     "rl/distributed.py",
-    "evaluation/stress_sweeps.py",
+    "evaluation/stress_parameters.py",
     "reporting/heat_map.py",
 ]
 """Modules that are imported before a configuration has been checked."""

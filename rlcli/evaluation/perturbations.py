@@ -17,7 +17,7 @@ from rlcli.envs.layout import TermLayout
 from rlcli.envs.observers import StepObserver
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import UsageError, listing
-from rlcli.evaluation.stress_sweeps import PHYSICAL, SIGNALS, Sweep, unknown_parameter_error
+from rlcli.evaluation.stress_parameters import PHYSICAL, SIGNALS, Sweep, unknown_parameter_error
 from rlcli.scene.entity import KINDS
 from rlcli.scene.model_fields import DERIVED_FROM, FIELDS
 from rlcli.scene.names import NameProblem, match

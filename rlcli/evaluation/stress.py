@@ -17,7 +17,7 @@ from rlcli.evaluation.evaluate import Evaluation, evaluate
 from rlcli.evaluation.limits import Limit
 from rlcli.evaluation.perturbations import Perturbations
 from rlcli.evaluation.session import MAX_ENVS, PolicyInTask, make_actor, one_each
-from rlcli.evaluation.stress_sweeps import Point, Sweep, by_name, describe_point, grid
+from rlcli.evaluation.stress_parameters import Point, Sweep, by_name, describe_point, grid
 from rlcli.progress import tracked
 from rlcli.random import derive
 from rlcli.rl.action_functions import Act

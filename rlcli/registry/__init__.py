@@ -19,8 +19,14 @@ from rlcli.registry.entries import (
 )
 from rlcli.registry.find import find_task, task_source
 from rlcli.registry.formats import is_framework
-from rlcli.registry.installed_tasks import installed_task, is_offered, package_folder, packaged_task, task_of_file
 from rlcli.registry.local_tasks import folder_task, python_config, python_place, python_task
+from rlcli.registry.locate_installed_tasks import (
+    installed_task,
+    is_offered,
+    package_folder,
+    packaged_task,
+    task_of_file,
+)
 from rlcli.registry.models import chosen_model, model_file
 from rlcli.registry.plugin_imports import load_entry
 from rlcli.registry.task_imports import import_file, load_module, load_object

@@ -7,8 +7,8 @@ from pathlib import Path
 from rlcli.errors import TaskError
 from rlcli.registry.entries import TASKS, catalog, find_entry
 from rlcli.registry.formats import find_in_formats, require_format
-from rlcli.registry.installed_tasks import installed_task, task_of_file
 from rlcli.registry.local_tasks import folder_task, python_task
+from rlcli.registry.locate_installed_tasks import installed_task, task_of_file
 from rlcli.registry.task_location import TaskSource
 
 KEYWORDS = ("latest", "shipped")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rlcli.errors import MissingModelError, TaskError, listing
 from rlcli.registry.entries import TASKS, find_entry
-from rlcli.registry.installed_tasks import installed_task, package_folders
+from rlcli.registry.locate_installed_tasks import installed_task, package_folders
 
 MODELS = "RLCLI_MODELS"
 """Environment variable with the user's folders of robot models, separated like the folders of PATH."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from rlcli.evaluation.stress_sweeps import Point, Sweep, format_value
+from rlcli.evaluation.stress_parameters import Point, Sweep, format_value
 from rlcli.runs.atomic_io import write_atomic
 
 FORMATS = (".png", ".svg")

@@ -21,8 +21,8 @@ from rlcli.sim.column_views import as_index
 from rlcli.sim.divergence_report import STATE_LIMIT, Divergence, StateLayout
 from rlcli.sim.env_selection import ALL, Field, Groups, Selection
 from rlcli.sim.gpu_env_selection import MaskSelection
+from rlcli.sim.warp_allocation import OVERFLOW_SETTINGS, overflow_error
 from rlcli.sim.warp_field_stages import FORCE, STATE
-from rlcli.sim.warp_memory import OVERFLOW_SETTINGS, overflow_error
 from rlcli.sim.warp_world_state import WarpWorlds
 
 _GroupFlags = wp.types.vector(length=mujoco.mjNGROUP, dtype=float)

@@ -21,8 +21,8 @@ from rlcli.sim.capacity import required_capacity
 from rlcli.sim.env_selection import Selection
 from rlcli.sim.quiet_mujoco import quiet_mujoco
 from rlcli.sim.saved_tensors import require_matching_tensors, substate
+from rlcli.sim.warp_allocation import put_on_device
 from rlcli.sim.warp_field_stages import FORCE, INPUTS, KINEMATICS, STATE, VELOCITY, FieldStages
-from rlcli.sim.warp_memory import put_on_device
 
 _CONSTANTS = (
     *("body_subtreemass", "dof_invweight0", "body_invweight0", "tendon_invweight0", "tendon_length0"),

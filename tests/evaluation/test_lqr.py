@@ -8,7 +8,7 @@ from rlcli.config.load import resolve
 from rlcli.errors import UsageError
 from rlcli.evaluation.lqr import regulator, riccati
 from rlcli.evaluation.stress import run_points
-from rlcli.evaluation.stress_sweeps import read_sweeps
+from rlcli.evaluation.stress_parameters import read_sweeps
 from rlcli.registry import find_task
 
 MODEL = """

@@ -7,7 +7,7 @@ from rlcli.config.load import resolve
 from rlcli.envs.make import make_env
 from rlcli.errors import UsageError
 from rlcli.evaluation.perturbations import Perturbations
-from rlcli.evaluation.stress_sweeps import read_sweeps
+from rlcli.evaluation.stress_parameters import read_sweeps
 from rlcli.registry import find_task
 
 MODEL = """

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from rlcli.cli.ui.console import console
-from rlcli.evaluation.stress_sweeps import grid, read_sweeps
+from rlcli.evaluation.stress_parameters import grid, read_sweeps
 from rlcli.reporting.heat_map import heat_map
 
 pytestmark = pytest.mark.usefixtures("empty_folder")

@@ -13,7 +13,7 @@ from support.worlds import CRITTER, CRITTER_TASK, build, edited, write
 from support.written_runs import learning, write_run
 
 import rlcli.errors
-from rlcli.evaluation.stress_sweeps import PHYSICAL, SIGNALS
+from rlcli.evaluation.stress_parameters import PHYSICAL, SIGNALS
 from rlcli.testing import CHECKS, RULES
 
 DOCS = REPOSITORY / "docs"

@@ -16,7 +16,7 @@ from rlcli.errors import UsageError
 if TYPE_CHECKING:
     from rlcli.evaluation.session import PolicyInTask, PolicyRequest
     from rlcli.evaluation.stress import StressResult
-    from rlcli.evaluation.stress_sweeps import Sweep
+    from rlcli.evaluation.stress_parameters import Sweep
     from rlcli.reporting.heat_map import HeatMap
 
 
@@ -100,7 +100,7 @@ def _record(tested: PolicyInTask) -> dict[str, Any]:
 
 
 def _read_sweeps(texts: list[str] | None, points: int) -> list[Sweep]:
-    from rlcli.evaluation.stress_sweeps import read_sweeps
+    from rlcli.evaluation.stress_parameters import read_sweeps
 
     if not texts:
         raise UsageError("no --sweep given", hint="for example: --sweep body_mass=0.5:2 or --sweep action_delay=0:3")
@@ -127,7 +127,7 @@ def _show(result: StressResult, policy: str, against: str | None) -> list[HeatMa
     """Print the table, the heat maps and the worst variant; return the heat maps."""
     from rlcli.cli.ui.evaluation_tables import interval, show_stress
     from rlcli.evaluation.limits import mean_or_rate
-    from rlcli.evaluation.stress_sweeps import describe_point
+    from rlcli.evaluation.stress_parameters import describe_point
     from rlcli.reporting.heat_map import heat_maps
 
     show_stress(result, against)

@@ -13,7 +13,7 @@ from rlcli.evaluation.limits import mean_or_rate
 if TYPE_CHECKING:
     from rlcli.evaluation.comparison import Comparison
     from rlcli.evaluation.stress import StressResult, Summary
-    from rlcli.evaluation.stress_sweeps import Point
+    from rlcli.evaluation.stress_parameters import Point
 
 INTERVAL = "95 % INTERVAL"
 
@@ -68,7 +68,7 @@ def show_stress(result: StressResult, against: str | None) -> None:
         result: the evaluations of all variants.
         against: name of the other policy of --against, for its column; None: there is none.
     """
-    from rlcli.evaluation.stress_sweeps import format_value
+    from rlcli.evaluation.stress_parameters import format_value
 
     metric = result.metric
     columns = [*(sweep.name for sweep in result.sweeps), metric.upper(), INTERVAL]

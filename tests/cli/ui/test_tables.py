@@ -9,7 +9,7 @@ import pytest
 from rlcli.cli.ui.console import console
 from rlcli.cli.ui.progress_view import TrainingView
 from rlcli.cli.ui.tables import fill
-from rlcli.evaluation.stress_sweeps import read_sweeps
+from rlcli.evaluation.stress_parameters import read_sweeps
 from rlcli.reporting.heat_map import heat_map
 from rlcli.training.progress import progress_from_metrics
 

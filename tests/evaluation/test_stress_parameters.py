@@ -3,7 +3,7 @@
 import pytest
 
 from rlcli.errors import UsageError
-from rlcli.evaluation.stress_sweeps import grid, read_sweeps
+from rlcli.evaluation.stress_parameters import grid, read_sweeps
 
 
 def read(text, points=5):
