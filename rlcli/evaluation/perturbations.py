@@ -416,7 +416,9 @@ def _axes(env: VecEnv, field: str, sweep: Sweep) -> list[int] | None:
     value = np.asarray(getattr(env.engine.model, field)) if field != "opt.gravity" else np.zeros((1, 3))
     width = value[:1].size
     if sweep.absolute and not own and width > 1:
-        raise NameProblem(f"with abs: the {width} values of {field} would become equal", "use a factor: leave out abs:")
+        raise NameProblem(
+            f"`abs:` would set all {width} values of {field} to one number", "leave out `abs:`, to scale them"
+        )
     return None
 
 

@@ -70,7 +70,7 @@ class PolicySpec(BaseModel):
         if not self.kind.startswith("gaussian-") and self.action_bound is None:
             raise ValueError(f"`kind: {self.kind}` needs a number in `action_bound`")
         if (self.kind == "gaussian-lstm") != bool(self.memory):
-            raise ValueError("`kind: gaussian-lstm` needs `memory`, and no other kind may have it")
+            raise ValueError("`kind: gaussian-lstm` needs `memory` (sizes of the LSTM), and no other kind may have it")
         if (self.kind == "gaussian-cnn") != (self.vision is not None):
             raise ValueError("`kind: gaussian-cnn` needs `vision`, and no other kind may have it")
         if self.vision is not None and self.vision.stop > self.observation_size:

@@ -315,7 +315,7 @@ def open_checkpoint(folder: Path) -> Checkpoint:
     manifest = parse_json(data, file)
     if type(manifest.get("format")) is not int or manifest["format"] != FORMAT:
         message = f"{folder} has checkpoint format {str(manifest.get('format'))[:40]}; this rlcli reads {FORMAT}"
-        raise FormatError(message, hint="use the rlcli version that run.json names, or an older checkpoint: RUN@step:N")
+        raise FormatError(message, hint="use the version of rlcli that wrote it (run.json or manifest.json names it)")
     step = check_json(_Manifest, manifest, file).step
     name = folder.name
     if name.isdecimal() and name.isascii() and len(name) >= 12 and int(name) != step:

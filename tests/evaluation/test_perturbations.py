@@ -303,7 +303,7 @@ def test_floating_entity_is_pushed_horizontally(world):
         ("effort_limit.slide=1:2", "no actuator matches 'slide'", "hinge"),
         ("gravity.arm=1:2", "to the whole world, not to an element", "leave out 'arm'"),
         ("tendon_stiffness=1:2", "the model has no tendons", None),
-        ("geom_size.rod=abs:1:2", "with abs: the 3 values of geom_size would become equal", "leave out abs:"),
+        ("geom_size.rod=abs:1:2", "`abs:` would set all 3 values of geom_size to one number", "leave out `abs:`"),
         ("observation_noise.poss=0:1", "no observation matches 'poss'", "did you mean 'pos'"),
         ("action_delay.trun=0:1", "no action matches 'trun'", "did you mean 'turn'"),
         ("push=0:1", "no entity has a floating base", "push.NAME"),

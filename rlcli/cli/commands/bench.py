@@ -136,7 +136,7 @@ def _report(
     changes = None if findings.recommended is None else bench.changes(findings.recommended.setting)
     if changes is not None and file is not None:
         write_atomic(file, bench_preset(resolved, changes, findings, machine, names_agent))
-        console.info(f"{command} --config {file}")
+        console.info(f"preset written; next: {command} --config {file}")
         console.data(str(file))
     console.document(
         "bench",
