@@ -302,7 +302,7 @@ def _terms_index() -> Iterator[str]:
 
 def _terms_page(section: str) -> Iterator[str]:
     yield f"# {section.capitalize()}\n"
-    yield SECTIONS[section] + "\n"
+    yield f"{SECTIONS[section]} [Terms](index.md) explains *root*, *soft limits*, *velocity_limit* and *origin*.\n"
     if section in ("events", "randomization"):
         yield "`mode` says when the change is made: `startup` once, at the start; `reset` when an episode starts;"
         yield "`interval` repeatedly, and then `interval_range_s` is required: the lowest and highest time between two"

@@ -32,7 +32,7 @@ def reset_joints_by_offset(
 ) -> None:
     """Reset joints to their default state plus uniform offsets [m or rad, m/s or rad/s].
 
-    Positions are clipped to the soft limits, velocities to the speed limits.
+    Positions are clipped to the joints' soft limits, velocities to their `velocity_limit`.
     """
     default_pos, default_vel = entity.data.read_default_joints(selection, joints)
     offset = selection.uniform(*_bounds(env, position, velocity), (2, default_pos.shape[1]))
@@ -50,7 +50,7 @@ def reset_joints_by_scale(
 ) -> None:
     """Reset joints to their default state times uniform factors.
 
-    Positions are clipped to the soft limits, velocities to the speed limits.
+    Positions are clipped to the joints' soft limits, velocities to their `velocity_limit`.
     """
     default_pos, default_vel = entity.data.read_default_joints(selection, joints)
     factor = selection.uniform(*_bounds(env, position, velocity), (2, default_pos.shape[1]))

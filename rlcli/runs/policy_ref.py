@@ -1,4 +1,8 @@
-"""References to policies on a command line: a run's checkpoint, a bundle, or the policy shipped with a task."""
+"""References to policies on a command line: a checkpoint of a run, or a bundle.
+
+A bundle is a folder with a policy alone, which `rlcli export --format bundle` writes; the policy shipped with a task is
+one.
+"""
 
 import os
 from dataclasses import dataclass

@@ -87,7 +87,10 @@ def _archive(data: bytes, where: str) -> zipfile.ZipFile:
         seen.add(name.casefold())
     total, limit = sum(member.file_size for member in members), min(_MAX_BYTES, available_memory() // 4)
     if total > limit:
-        raise CheckpointError(f"{where} unpacks to {total:,} bytes; at most {limit:,} are allowed")
+        message = (
+            f"{where} unpacks to {total:,} bytes; at most {limit:,} are read (4 GiB, or a quarter of the free memory)"
+        )
+        raise CheckpointError(message, hint="free memory, or give a smaller policy")
     return archive
 
 

@@ -317,7 +317,7 @@ def value_function(health: Health) -> Found:
 
 
 def observations(health: Health) -> Found:
-    """Report observations that are constant, or mostly at the limits of their `clip`."""
+    """Report observations that are the same in all environments, or mostly at the limits of their `clip`."""
     for metric in health.names("Health/constant/"):
         if health.median(metric) == 1.0 and health.struggles(0.1):
             name = metric.rpartition("/")[2]

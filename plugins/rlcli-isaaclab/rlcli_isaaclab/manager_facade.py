@@ -131,7 +131,10 @@ class CommandManagerFacade(ManagerFacade):
 
 
 class BuiltinCommand:
-    """Built-in command of rlcli, as code written for Isaac Lab's class reads it: other attributes raise an error."""
+    """Command term of rlcli in place of Isaac Lab's `CommandTerm`, for example a velocity command.
+
+    Its attributes can be read; one that rlcli's term does not have raises an error with a hint.
+    """
 
     def __init__(self, term: Any) -> None:
         self._term = term

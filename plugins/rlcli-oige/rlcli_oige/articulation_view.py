@@ -336,8 +336,8 @@ class ArticulationView(XFormPrimView):
                 sensor = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, f"{self.entity.name}/{name}{suffix}")
                 if sensor < 0:
                     raise TaskError(
-                        f"view '{self.name}': the model has no sensors of joint forces. rlcli adds them only if the file of"
-                        " the task's class or of the view names get_measured_joint_forces",
+                        f"view '{self.name}': the model has no sensors of joint forces. rlcli adds them only if the"
+                        " file of the task's class or of the view names get_measured_joint_forces",
                         hint="move the call to that file, or name the method there in a comment",
                     )
                 columns.append(list(range(model.sensor_adr[sensor], model.sensor_adr[sensor] + 3)))
