@@ -1,6 +1,7 @@
 """Failure cases: recordings of failed and outlier episodes of a training, as `rlcli autopsy` reads and shows them.
 
-No code of a run is executed.
+Reading and listing them executes no code. `stage_case` builds the task to draw contacts, and so runs the task's code,
+which must be trusted (`rlcli.runs.trusted_tasks`).
 """
 
 import logging

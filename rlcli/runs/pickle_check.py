@@ -134,7 +134,7 @@ class _Simulation:
         if outer.depth > _MAX_DEPTH:
             raise _RefusedError(f"has values nested deeper than {_MAX_DEPTH} levels")
         if outer.size > MAX_BYTES:
-            raise _RefusedError(f"has over {MAX_BYTES:,} values, counted with repetitions")
+            raise _RefusedError(f"has over {MAX_BYTES:,} objects, each counted as often as it is referred to")
 
 
 def _result(function: str, arguments: _Value) -> _Value:

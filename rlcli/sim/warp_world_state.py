@@ -164,7 +164,8 @@ class WarpWorlds:
         for name, values in substate(state, "model.").items():
             if not values.is_floating_point() and self.expanded(name) is None:
                 raise ValueError(
-                    f"model field '{name}' differs from the saved one; restore the MJCF of the saved state"
+                    f"the saved state has values of model field '{name}' for each environment, and this task has none;"
+                    " restore the events and the code of the saved state"
                 )
             require_matching_tensors({name: values}, {name: self.expand(name)}, "engine")
             self.expand(name).copy_(values)

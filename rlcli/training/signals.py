@@ -56,7 +56,10 @@ class StopRequest(StepObserver):
 
     @contextlib.contextmanager
     def before_training(self, interruptible: bool = True) -> Iterator[None]:
-        """End the `with` block, which prepares a training, at the first signal.
+        """Stop at the first signal: inside the `with` block, which prepares a training, or at its end.
+
+        Args:
+            interruptible: stop inside the block; otherwise at its end.
 
         Raises:
             Stopped: on a signal.

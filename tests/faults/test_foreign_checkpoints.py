@@ -679,7 +679,7 @@ SHARED = b"N" + b"".join(b"q%ch%c\x86" % (i, i) for i in range(60))
 """A tuple of two references to a tuple of two references ...: its hash takes 2^60 steps."""
 STORAGE = b"ctorch\nFloatStorage\n"
 COSTLY = {
-    "shared tuples as a key": (b"}" + SHARED + b"Ns.", "counted with repetitions"),
+    "shared tuples as a key": (b"}" + SHARED + b"Ns.", "counted as often as it is referred to"),
     "shared lists": (b"]" + b"".join(b"q%c]h%cah%ca" % (i, i, i) for i in range(60)) + b".", "with repetitions"),
     "nested tuples as a key": (b"}N" + b"\x85" * 1_000_000 + b"Ns.", "deeper than 100 levels"),
     "nested lists": (b"]" * 200 + b"a" * 199 + b".", "deeper than 100 levels"),

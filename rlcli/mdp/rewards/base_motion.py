@@ -123,9 +123,9 @@ def yaw_aligned(env: ManagedEnv, *, entity: Entity = "robot", std: float = 0.5) 
 def move_to_target_bonus(
     env: ManagedEnv, *, entity: Entity = "robot", threshold: float, target: tuple[float, float, float]
 ) -> Tensor:
-    """1 where the cosine between the root's heading and the way to `target` is above `threshold`. (num_envs,)
+    """Cosine between the root's heading and the way to `target`, divided by `threshold`, at most 1. (num_envs,)
 
-    Elsewhere cosine / threshold. target: a point from the environment's origin [m].
+    target: a point from the environment's origin [m].
     """
     to_target = constant(target, env.device)[:2] + env.origins[:, :2] - entity.data.root_pos_w[:, :2]
     forward = entity.data.forward_w

@@ -150,10 +150,10 @@ class Objective:
         self._mean_scale = 1.0 / (std * len(advantage))
 
     def mean_gradient(self, rows: slice, mean: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the gradient of the actor's outputs, as `rlcli.rl.mlp_gradients.OutputGradient`.
+        """Return the gradient of the loss with respect to the actor's outputs, and statistics that are added up.
 
-        The summed numbers are surrogate, number of clipped ratios, bounds loss, (3,); gradients of the log std, (a,);
-        and squared distances between old and new mean, (a,).
+        The statistics are surrogate, number of clipped ratios, bounds loss, (3,); gradients of the log std, (a,);
+        and squared distances between old and new mean, (a,). See `rlcli.rl.mlp_gradients.OutputGradient`.
         """
         config, batch = self._config, self.batch
         self.mean[rows] = mean
@@ -169,7 +169,7 @@ class Objective:
         return gradient, torch.cat((torch.stack((surrogate, clipped, bounds)), log_std_gradient, distance))
 
     def value_gradient(self, rows: slice, value: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the gradient of the critic's outputs, as `OutputGradient`; the summed number is the squared error."""
+        """Return the gradient of the loss with respect to the critic's outputs, and the sum of the squared errors."""
         config, value, old_value = self._config, value.squeeze(-1), self.batch.value[rows]
         error = value - self.batch.target[rows]
         if config.clip_value is None:
