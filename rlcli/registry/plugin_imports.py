@@ -205,7 +205,8 @@ def _restore_torch(before: _TorchSettings, changed: _TorchSettings) -> None:
 
 def error_location(error: BaseException) -> str:
     """Return ` (file:line)` of the code that raised an error; empty if the message has it already (SyntaxError)."""
-    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename != __file__]
+    own = (__file__, os.path.join(os.path.dirname(__file__), "task_code_monitor.py"))  # its `exit_refused` raises
+    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename not in own]
     if isinstance(error, SyntaxError) or not frames or frames[-1].filename.startswith("<frozen"):
         return ""
     return f" ({frames[-1].filename}:{frames[-1].lineno})"

@@ -129,7 +129,7 @@ def list_failure_cases(run: Run) -> list[FailureCase]:
         return []
     with read_errors(folder):
         require_inside(run.folder, folder)
-    require_plain_entries(folder)
+    require_plain_entries(folder, only_links=True)
     cases = []
     for file in sorted(file for file in folder.iterdir() if FILE_NAME.fullmatch(file.name))[:_MAX_FILES]:
         try:

@@ -219,10 +219,14 @@ def require_inside(folder: Path, file: Path) -> None:
         raise OSError(errno.ELOOP, "it is a link out of the folder; replace it by the file itself", str(file))
 
 
-def require_plain_entries(folder: Path) -> None:
+def require_plain_entries(folder: Path, *, only_links: bool = False) -> None:
     """Check that a folder of a run contains only regular files and folders.
 
     A write through a link would change files outside the run, and opening a pipe would block.
+
+    Args:
+        folder: the folder.
+        only_links: refuse only links, for a caller that reads files without blocking.
 
     Raises:
         CheckpointError: with the first other entry.
@@ -235,7 +239,7 @@ def require_plain_entries(folder: Path) -> None:
         raise CheckpointError(f"{folder} cannot be read: {error.strerror}") from None
     if links:
         raise CheckpointError(f"{folder / links[0]} is a link; replace it by the file itself")
-    if special:
+    if special and not only_links:
         raise CheckpointError(f"{folder / special[0]} is not a regular file; move it out of the run")
 
 

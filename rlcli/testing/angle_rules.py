@@ -27,6 +27,8 @@ def degrees(evidence: RolloutEvidence) -> Iterator[Remark]:
     for path, value in leaves(evidence.subject.resolved.task.model_dump()):
         keys = [(str(path[0]), str(key)) for key in path[:-3:-1]]  # the last key may be the name of a joint
         bound = next((_LARGEST_ANGLES[key] for key in keys if key in _LARGEST_ANGLES), None)
+        if keys[0][1] == "target" and isinstance(value, list | tuple):
+            continue  # a point [m]
         numbers = [v for v in (value if isinstance(value, list | tuple) else [value]) if isinstance(v, int | float)]
         largest = max(map(abs, numbers), default=0.0)
         if bound is not None and bound * 1.01 < largest < math.inf:

@@ -124,7 +124,7 @@ def test_probe_fills_cache_and_reports_broken_tasks(plugins, spec, cli, command)
     assert found["crashes-task"]["broken"] == "ended the process (exit 7)"
     assert found["killed-task"]["broken"] == "crashed (SIGKILL)"
     assert "out of cheese" in found["raises-task"]["broken"]
-    assert found["invalid-task"]["broken"].endswith("task.yaml:1:1: missing key 'sim' (and 6 more)")
+    assert found["invalid-task"]["broken"].endswith("task.yaml:1:1: missing key 'sim' at the top level (and 6 more)")
     again = rows(command("list-tasks", "--json"))
     assert {name: again[name] for name in found} == found
     assert "broken: ended the process (exit 7)" in command("list-tasks").stdout

@@ -134,7 +134,7 @@ def test_origin_of_changed_value_is_run_file(cli, tmp_path):
 def test_direct_task_page_has_parameters_and_docstrings(cli, tmp_path):
     write_run(tmp_path / "runs", "cartpole-direct", rows=learning())
     page = read(cli("report", "latest").out.strip())
-    assert "minus penalties on the pole's angle and on speeds; -2 for a failure" in page.text
+    assert "Reward an upright pole and slow joints; a failure costs 2" in page.text
     assert "Force on the cart at action 1 [N]." in page.text
 
 

@@ -125,7 +125,7 @@ def test_direct_task_card_has_parameters_and_docstrings():
         "Parameter": "max_effort", "Value": "250", "What": "Force on the cart at action 1 [N].", "Default": "400",
     }  # fmt: skip
     words = rows(content, "Docstrings of the task")
-    reward = "Write the rewards to `rew_buf`: 1, minus penalties on the pole's angle and on speeds; -2 for a failure."
+    reward = "Reward an upright pole and slow joints; a failure costs 2."
     assert words["Reward"]["What"] == reward
     assert words["Start of an episode"]["Hook"] == "reset_idx"
     assert rows(content, "Observations: policy")["pole_vel"]["Unit"] == "rad/s"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -78,8 +79,7 @@ def command(
     options.video_file(video, _FALLBACK_VIDEO)
     viewers = choose_viewers(viewer, port, headless=headless or to_file)
     _check_record(record, record_mode, video, held)
-    if seconds is not None and (viewer == "none" or record is not None or env is not None):
-        raise UsageError("--seconds limits a video or viewer of any episode", hint="leave out --seconds")
+    _check_seconds(seconds, viewer, record, env)
     if env is not None or episode is not None:
         check_choice(env, episode, num_envs, record_mode, held)
     words, usual = overrides or [], max(_VIDEO_ENVS, drawn) if video is not None and env is None else None
@@ -88,10 +88,7 @@ def command(
     )
     session = open_session(request)
     file = _default_video(session) if str(video) == options.CHOOSE else video
-
-    def watch() -> bool:
-        return show(session, viewers, port=port, drawn=drawn, longest_s=seconds)
-
+    watch = functools.partial(show, session, viewers, port=port, drawn=drawn, longest_s=seconds)
     if env is not None and episode is not None:
         play_episode(session, env, episode, video=file, record=record, watch=watch)
         return
@@ -110,6 +107,11 @@ def _check_record(record: Path | None, mode: str, video: Path | None, commands: 
     if record is not None and commands:
         raise UsageError("--record cannot be combined with --command", hint="leave out --record or --command")
     check_record(record, mode)
+
+
+def _check_seconds(seconds: float | None, viewer: str | None, record: Path | None, env: int | None) -> None:
+    if seconds is not None and (viewer == "none" or record is not None or env is not None):
+        raise UsageError("--seconds limits a video or viewer of any episode", hint="leave out --seconds")
 
 
 def _prepare(session: Session, drawn: int, commands: dict[str, float]) -> None:

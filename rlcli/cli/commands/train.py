@@ -87,9 +87,7 @@ def command(
     console.muted = not distributed.is_rank_zero()
     request = TrainingRequest(runs_dir or default_runs_dir(), None, resume, agent, device, gpus, config)
     request.overrides, request.flags = overrides or [], flags(scene__num_envs=num_envs)
-    ends = {"agent.until": until, "agent.max_minutes": max_minutes}
-    request.budget = options.budget_keys(max_iterations, max_steps)
-    request.budget |= {key: value for key, value in ends.items() if value is not None}
+    request.budget = options.budget_keys(max_iterations, max_steps, until, max_minutes)
     request.seed = options.random_if_minus_one(42 if seed is None else seed)
     request.loggers, request.init_from, request.video_every, request.name = logger, init_from, video_every, name
     study = _study(request, seeds, jobs, seed)

@@ -37,24 +37,19 @@ def command(
     unchecked = [] if agent else check_all(source, config_file=config, overrides=words)
     resolved = resolve(source, agent=agent, config_file=config, overrides=words)
     resolve(source, agent=agent, play=True, config_file=config, overrides=words)
-    missing = missing_models(resolved)
-    checked = "files"
     if deep:
         from rlcli.envs.make import make_env
 
         small = resolve(source, agent=agent, config_file=config, overrides=words, flags={"scene.num_envs": 2})
         make_env(small).reset(seed=0)
-        checked = "files and model"
     log_notes(resolved.notes)
     shown = target if source.python is not None and source.distribution is None else source.label
-    console.data(f"{shown}: valid ({checked})")
-    for sentence in missing:
+    console.data(f"{shown}: valid ({'files and model' if deep else 'files'})")
+    for sentence in missing_models(resolved):
         console.warn(f"model of {sentence}")
     if unchecked:
-        console.warn(
-            f"agents that are not checked, because their trainer is not installed: {', '.join(unchecked)};"
-            " install the trainer to check them"
-        )
+        names = ", ".join(unchecked)
+        console.warn(f"not checked, because the trainer is not installed: agents {names}; install the trainer")
     console.document(
         "validate",
         file=str(source.config),

@@ -223,15 +223,19 @@ def _with_strict_number(parameter: inspect.Parameter) -> inspect.Parameter:
     return parameter.replace(annotation=Annotated[strict | None, info])
 
 
-def budget_keys(max_iterations: int | None, max_steps: int | None) -> dict[str, Any]:
-    """Return --max-iterations and --max-steps as overrides of the agent: dotted key -> value.
+def budget_keys(
+    max_iterations: int | None, max_steps: int | None, until: str | None = None, max_minutes: float | None = None
+) -> dict[str, Any]:
+    """Return the options that end a training as overrides of the agent, without those that are None: key -> value.
 
-    If the user has set one of them, the other becomes None, so that the agent's own budget does not end the training
-    first. Empty if the user has set neither.
+    If the user has set one of --max-iterations and --max-steps, the other becomes None, so that the agent's own budget
+    does not end the training first.
     """
-    if max_iterations is None and max_steps is None:
-        return {}
-    return {"agent.max_iterations": max_iterations, "agent.max_steps": max_steps}
+    ends = {"agent.until": until, "agent.max_minutes": max_minutes}
+    keys: dict[str, Any] = {key: value for key, value in ends.items() if value is not None}
+    if max_iterations is not None or max_steps is not None:
+        keys |= {"agent.max_iterations": max_iterations, "agent.max_steps": max_steps}
+    return keys
 
 
 def video_file(video: Path | None, default: str) -> Path | None:
