@@ -680,7 +680,7 @@ SHARED = b"N" + b"".join(b"q%ch%c\x86" % (i, i) for i in range(60))
 STORAGE = b"ctorch\nFloatStorage\n"
 COSTLY = {
     "shared tuples as a key": (b"}" + SHARED + b"Ns.", "counted as often as it is referred to"),
-    "shared lists": (b"]" + b"".join(b"q%c]h%cah%ca" % (i, i, i) for i in range(60)) + b".", "with repetitions"),
+    "shared lists": (b"]" + b"".join(b"q%c]h%cah%ca" % (i, i, i) for i in range(60)) + b".", "as often as it is"),
     "nested tuples as a key": (b"}N" + b"\x85" * 1_000_000 + b"Ns.", "deeper than 100 levels"),
     "nested lists": (b"]" * 200 + b"a" * 199 + b".", "deeper than 100 levels"),
     "a list put into lists before they are filled": (b"]q\x00]q\x01h\x00ah\x00h\x01a.", "part of another"),
