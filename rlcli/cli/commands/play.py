@@ -111,7 +111,10 @@ def _check_record(record: Path | None, mode: str, video: Path | None, commands: 
 
 def _check_seconds(seconds: float | None, viewer: str | None, record: Path | None, env: int | None) -> None:
     if seconds is not None and (viewer == "none" or record is not None or env is not None):
-        raise UsageError("--seconds limits a video or viewer of any episode", hint="leave out --seconds")
+        raise UsageError(
+            "--seconds cannot be combined with --viewer none, --record or --env: it ends a video, a window or a page",
+            hint="leave out --seconds",
+        )
 
 
 def _prepare(session: Session, drawn: int, commands: dict[str, float]) -> None:
