@@ -62,7 +62,7 @@ PANELS = {
 }
 """Panel of `--help` -> its commands, in the order in which they are usually used."""
 GROUPS = {"import": "import_"}
-"""Command with subcommands -> module of `rlcli.cli.commands` with their `app`."""
+"""Name of a command with subcommands -> the module of `rlcli.cli.commands` that defines them in its `app`."""
 COMMANDS = tuple(name for names in PANELS.values() for name in names if name not in GROUPS)
 """Commands without subcommands. Each has its own module in `rlcli.cli.commands`, with a function `command`."""
 
@@ -129,7 +129,7 @@ def main(arguments: list[str] | None = None) -> int:
     if not {"COMP_WORDS", "_TYPER_COMPLETE_ARGS"}.intersection(os.environ) and "complete_" in os.environ.get(
         _COMPLETION_VARIABLE, ""
     ):
-        del os.environ[_COMPLETION_VARIABLE]  # left over from a completion: its words are missing
+        del os.environ[_COMPLETION_VARIABLE]  # a shell completion set it earlier; nothing is completed now
     remember_given([*arguments, *(value for name, value in os.environ.items() if name.startswith("RLCLI_"))])
     console.json, console.debug = "--json" in arguments, "--debug" in arguments
     console.has_document = False  # an earlier command of this process may have printed one
@@ -146,9 +146,12 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _on_alarm(_: int, frame: FrameType | None) -> None:
-    """Raise an error for a timer of a task's code, which would otherwise end the process without a message."""
+    """Raise an error when a timer that a task's code has set expires.
+
+    Without this handler the timer's signal, SIGALRM, would end the process without a message.
+    """
     place = place_in_task(frame)
-    message = "a timer has ended (SIGALRM), and no handler is set"
+    message = "a timer has expired, and the task's code has set no handler for its signal SIGALRM"
     raise TaskError(f"{place}: {message}" if place else message, hint="remove signal.alarm or signal.setitimer")
 
 
@@ -186,7 +189,7 @@ def _require_words(arguments: list[str]) -> None:
     }
     for word, place in words.items():
         if any("\ud800" <= character <= "\udfff" for character in word):  # a byte that is not UTF-8
-            raise UsageError(f"{place} is not UTF-8: '{word}'", hint="rename the file or folder that it names")
+            raise UsageError(f"{place} is not UTF-8: '{word}'", hint="rename this file or folder")
 
 
 def _run(arguments: list[str]) -> int:
@@ -278,7 +281,10 @@ def _as_rlcli_error(error: BaseException, arguments: list[str]) -> RlcliError:
 
 
 def _user_settings(arguments: list[str]) -> dict[str, Any]:
-    """Return the user's settings; help, completion and `doctor` also work if the file is broken."""
+    """Return the values of the user's settings file, and set the verbosity of the console.
+
+    If the file is broken, help, shell completion and `rlcli doctor` go on without settings; other commands fail.
+    """
     try:
         settings = read_settings()
     except ConfigError:
@@ -287,7 +293,7 @@ def _user_settings(arguments: list[str]) -> dict[str, Any]:
             raise
         settings = {}
     verbosity = settings.get("verbosity")
-    console.quiet = verbosity == "quiet"  # a flag may change it
+    console.quiet = verbosity == "quiet"  # -q or -v on the command line may change it later
     console.verbose = verbosity == "verbose" or not {"-v", "--verbose"}.isdisjoint(arguments)
     if settings:
         console.detail(f"settings: {settings_file()}")
@@ -359,6 +365,6 @@ _FOREIGN_OPTIONS = {
     "load-run": "--checkpoint RUN names a run or one of its checkpoints; `rlcli train --resume RUN` continues a run",
     "enable-cameras": "leave out this option: cameras of a task need none",
 }
-"""Option of another program -> what to write for rlcli."""
+"""Option that users know from other training programs -> hint that says what to write in rlcli instead."""
 _SHORT_FOR = {"lr": "learning_rate"}
-"""Abbreviation that users type -> key of the agent's settings."""
+"""Abbreviation of an option that users type -> full name of the key in the agent's settings."""

@@ -1,4 +1,4 @@
-"""Import hooks of the command line: checks and settings for large libraries."""
+"""Import hooks that the command line installs: one checks the memory limit, one protects matplotlib's settings."""
 
 import contextlib
 from collections.abc import Sequence
@@ -27,14 +27,15 @@ class AddressSpaceCheck:
 
 
 class MatplotlibFinder:
-    """Import hook that imports matplotlib with its own folder as the current folder.
+    """Import hook that changes to matplotlib's own folder while matplotlib is imported.
 
-    matplotlib reads a file `matplotlibrc` of the current folder, which may be a pipe or belong to someone else.
+    During its import, matplotlib reads a file `matplotlibrc` of the current folder, if there is one. That file may
+    be a pipe without a writer, or belong to another user.
     """
 
     @staticmethod
     def find_spec(name: str, path: Sequence[str] | None = None, target: ModuleType | None = None) -> ModuleSpec | None:
-        """For matplotlib, return a specification whose loader changes the current folder meanwhile; else None."""
+        """Return a module specification whose loader changes the current folder; None for modules but matplotlib."""
         spec = PathFinder.find_spec(name, path, target) if name == "matplotlib" else None
         if spec is None or spec.loader is None or spec.origin is None:
             return None

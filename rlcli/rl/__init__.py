@@ -1,1 +1,1 @@
-"""Policies, networks, and the trainers `ppo` and `sb3`."""
+"""The learning side of rlcli: policies, networks, and the trainers `ppo` (built in) and `sb3` (Stable-Baselines3)."""

@@ -13,7 +13,7 @@ from rlcli.rl.policy import Policy
 Act = Callable[[Tensor], Tensor]
 """Action function: observations (num_envs, d) -> actions (num_envs, a)."""
 PATIENCE = 10
-"""Number of episode lengths after which an evaluation stops an episode that does not end."""
+"""An evaluation stops after this number of full episode lengths; episodes that have not ended by then are cut off."""
 
 
 def trained_policy(

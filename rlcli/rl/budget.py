@@ -37,7 +37,10 @@ class Budget:
 
 
 def remaining_budget(config: AgentConfig, trainer: Trainer) -> float:
-    """Return the share of an agent's budget that is left, from 1 to 0, for schedules; constant during an iteration."""
+    """Return the fraction of an agent's budget that is left, from 1 (start of the training) to 0 (end).
+
+    Schedules, such as that of the learning rate, use the value. It is constant during an iteration.
+    """
     by_iterations = trainer.iteration / (config.max_iterations or math.inf)
     by_steps = trainer.iteration * trainer.steps_per_iteration / (config.max_steps or math.inf)
     return 1.0 - min(1.0, max(by_iterations, by_steps))

@@ -38,7 +38,7 @@ class CnnSpec(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     pictures: Annotated[list[ImageSpec], Field(min_length=1, max_length=16)]
-    """Images in the order of their columns, without overlap. Saved policies have this key."""
+    """Images of the observation, sorted by their first column; their columns must not overlap."""
     channels: Annotated[list[_Size], Field(min_length=1, max_length=16)]
     """Output channels of each layer."""
     kernels: list[_Size]
@@ -132,7 +132,10 @@ class Cnn(nn.Module):
 
 
 def motion_channels(pixels: Tensor, steps: int, factor: float) -> Tensor:
-    """Replace each older image of a history by (newest - older) * factor. Oldest first. (n, steps x c, h, w)"""
+    """Replace each older image of a history by (newest - older) * factor; the oldest image has the first channels.
+
+    (n, steps x c, h, w) -> the same shape.
+    """
     frames = torch.unflatten(pixels, 1, (steps, -1))
     newest = frames[:, -1:]
     return torch.cat([factor * (newest - frames[:, :-1]), newest], dim=1).flatten(1, 2)

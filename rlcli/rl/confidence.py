@@ -16,7 +16,7 @@ RESAMPLES = 2000
 _GRID = 20_001
 """Number of points of the numerical integration in `student_quantile`."""
 _SEED = 0
-"""Fixed seed: the same values always give the same interval."""
+"""Seed of the bootstrap samples; it is fixed so that the same values always give the same interval."""
 _BLOCK = 2**21
 """Largest number of random indices of bootstrap samples that are in memory at a time."""
 

@@ -129,9 +129,9 @@ class Recording:
 
 
 def _copy_back(tensors: list[tuple[Any, str, Tensor]]) -> None:
-    """Copy tensors that the function has rebound to their old addresses, which the next replay reads.
+    """Copy the tensors that the function has replaced by new ones back into the old memory, which a replay reads.
 
-    `tensors` has (object, attribute, tensor before the call).
+    `tensors` has entries (object, name of the attribute, tensor of this attribute before the call).
     """
     for holder, name, old in tensors:
         new = getattr(holder, name)

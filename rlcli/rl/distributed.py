@@ -22,12 +22,15 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 _TIMEOUT = timedelta(minutes=10)
-"""Longest wait for the other processes, which may be compiling kernels."""
+"""Time after which waiting for other processes is an error; it is long because they may compile GPU kernels."""
 
 
 @dataclass(frozen=True, slots=True)
 class ProcessGroup:
-    """Processes of a run and the rank of this one. With a world size of 1 no method communicates."""
+    """Group of the processes that train one policy together; it knows the rank of this process.
+
+    With a world size of 1 (a single process) the methods return at once, without communication.
+    """
 
     rank: int = 0
     world_size: int = 1
@@ -39,7 +42,10 @@ class ProcessGroup:
         return self.rank == 0
 
     def seed(self, seed: int, purpose: str) -> int:
-        """Return the seed of this process for a purpose: `seed` on rank 0, a seed derived from it on other ranks."""
+        """Return this process's own seed for a purpose, such as exploration.
+
+        It is `seed` itself on rank 0, and a seed derived from `seed`, the purpose and the rank on the other ranks.
+        """
         if self.is_rank_zero:
             return seed
         from rlcli.random import derive
@@ -152,8 +158,8 @@ def launch(processes: int, arguments: Sequence[str]) -> int:
     """Run `rlcli ARGUMENTS` in several processes of this machine.
 
     Returns:
-        0 if all succeed; the exit code of a process that failed, and not only because another one had failed; if a
-        signal stopped the launcher, the exit code for that signal.
+        0 if all processes succeed. If a signal stopped the launcher: the exit code for that signal. Else the exit code
+        of the process whose failure was the cause; processes that fail because another one is gone do not count.
     """
     import logging
 

@@ -18,7 +18,7 @@ _METRICS = {
     "held": "Success",
     "value": "Success_Value",
 }
-"""Prefix of a sum's name in `EpisodeStatistics.add` -> group of the metric that is computed from the sum."""
+"""Prefix of the name of a sum over episodes -> group (first part of the name) of the metric computed from the sum."""
 
 
 class EpisodeStatistics:
@@ -38,7 +38,7 @@ class EpisodeStatistics:
     """
 
     WINDOW = 100
-    """Smallest number of episodes of `Train/*`."""
+    """Number of finished episodes that the metrics `Train/*` average over at least."""
 
     def __init__(self, episode_length_s: float) -> None:
         self._episode_length_s = episode_length_s
@@ -68,7 +68,7 @@ class EpisodeStatistics:
         self._sums[names].addmv_(matrix, weight)
 
     def all_reduce(self, process_group: ProcessGroup) -> None:
-        """Sum the statistics over all processes; before each has finished an episode, change nothing."""
+        """Sum the statistics over all processes; until every process has finished an episode, change nothing."""
         own = len(self._sums)
         (total,) = process_group.sum(own)
         if own and total == own * process_group.world_size:

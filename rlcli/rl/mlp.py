@@ -28,7 +28,7 @@ _ROWS, _WIDE = 8192, 64
 """Samples are computed in parts of at most `_ROWS` rows if the widest layer has `_WIDE` outputs, and fewer rows for
 wider layers: with more rows, intermediate results do not fit into the cache."""
 _pools: list[ThreadPoolExecutor] = []
-"""The thread pool that `use_threads` has made; empty for one thread."""
+"""List with the thread pool that `use_threads` has created; empty if one thread is used."""
 
 
 def use_threads(count: int) -> None:
@@ -40,7 +40,7 @@ def use_threads(count: int) -> None:
 
 
 def part_rows(layers: Iterable[nn.Module]) -> int:
-    """Return the largest number of samples whose intermediate results in these layers stay in the cache."""
+    """Return the number of samples (rows) whose intermediate results in these layers just fit into the CPU's cache."""
     widths = [layer.out_features for layer in layers if isinstance(layer, nn.Linear)]
     return max(1, _ROWS * _WIDE // max(_WIDE, *widths))
 

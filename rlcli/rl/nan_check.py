@@ -1,4 +1,8 @@
-"""Checks of a learner for NaN and infinity. The error names the first tensor that is not finite: the others follow."""
+"""Checks for NaN and infinity in a trainer's tensors.
+
+Tensors are checked in the order in which they are computed. The error names the first one that is not finite, because
+it is the cause: NaN spreads to all tensors that are computed from it.
+"""
 
 from __future__ import annotations
 

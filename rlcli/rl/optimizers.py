@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-_SLOTS = {  # tensors that each optimiser needs for a parameter
+_SLOTS = {  # names of the tensors that the state of each optimiser has for a parameter
     "Adam": {"step", "exp_avg", "exp_avg_sq"},
     "AdamW": {"step", "exp_avg", "exp_avg_sq"},
     "RMSprop": {"step", "square_avg"},

@@ -19,7 +19,7 @@ _LOG_STD_RANGE = (-20.0, 2.0)
 _MAX_BYTES = 2**31
 _OTHER = "export it again, or use another checkpoint"
 _LogStd = Annotated[float, Field(ge=-80, le=80)]
-"""Logarithm of a standard deviation that single precision can hold."""
+"""Largest absolute value of a log standard deviation: the standard deviation must fit into a float32."""
 Layers = Annotated[list[Width], Field(max_length=100)]
 """Width of each layer."""
 
@@ -159,9 +159,9 @@ class Lstm(nn.Module):
         self.cells, self.dtype = list(cells), torch.float64 if wide else torch.float32
 
     def blank(self, rows: int) -> Tensor:
-        """Return zero hidden states for `rows` samples. (rows, 2 x cells of all layers)
+        """Return zero hidden states for `rows` samples. (rows, 2 x number of cells of all layers)
 
-        The columns are h and c of the first layer, then h and c of the next one.
+        The columns are the output h and the cell state c of the first layer, then h and c of the next layer.
         """
         return torch.zeros(rows, 2 * sum(self.cells), dtype=self.dtype, device=next(self.parameters()).device)
 
@@ -309,7 +309,7 @@ def size_of(policy: Policy) -> int:
 
 
 def filled(policy: Policy, weights: Mapping[str, Tensor]) -> Policy:
-    """Load weights into a policy returned by `blank_policy`; return the policy in evaluation mode.
+    """Load weights into a policy that `blank_policy` has returned; return this policy in evaluation mode.
 
     Raises:
         CheckpointError: if the weights do not fit, or a weight is not finite.

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Rows:
-    """Newest rows of data that only grows, such as a replay buffer. A checkpoint writes only rows that are new."""
+    """Rows of data that only grows, such as a replay buffer; a checkpoint writes only the rows added since the last."""
 
     first: int
     """Index of the oldest row that is still needed. Row 0 is the first row ever stored."""

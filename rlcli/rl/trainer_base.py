@@ -17,7 +17,7 @@ from rlcli.rl.policy import Policy, PolicySpec
 from rlcli.rl.trainer import Report
 
 _RECENT_OBS = 256
-"""Number of observations in a checkpoint, on which an exported policy is compared with the trained one."""
+"""Number of observations that a checkpoint stores; an exported file is tested with them against the policy."""
 
 
 class BaseTrainer(ABC):

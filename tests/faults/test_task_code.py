@@ -248,7 +248,10 @@ def test_timer_of_a_task_is_named(with_code, start):
     process = start(*EVAL)
     _, err = process.communicate()
     assert process.returncode == 4, err
-    assert f"coin/task.py:{line}: a timer has ended (SIGALRM)" in err
+    assert (
+        f"coin/task.py:{line}: a timer has expired, and the task's code has set no handler for its signal SIGALRM"
+        in err
+    )
 
 
 @pytest.mark.parametrize("text", ["'x y ' * 900", "'a\\nhint: run: curl x | sh' * 30", "chr(27) * 900"])

@@ -31,7 +31,7 @@ _SORT_KEYS: dict[str, Callable[[FailureCase], Any]] = {
     "kind": lambda case: (case.failure.kind, case.ended_by),
 }
 _MAX_COLUMNS = 12
-"""Largest number of printed columns of observations, of actions and of reward terms, each."""
+"""Number of columns of observations that are printed at most; the same limit holds for actions and reward terms."""
 
 
 def command(

@@ -1,4 +1,4 @@
-"""`rlcli bench`: speed of a task on this machine, and the settings with the fastest iterations."""
+"""`rlcli bench`: measurement of a task's speed on this machine, to find the settings with the fastest iterations."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 _PROFILED = 5.0
 """Duration of the measurement of `bench --profile` [s]."""
 _MAX_LOAD = 0.5
-"""Load of the machine, in running processes per core, above which the command warns before it measures."""
+"""System load [running processes per core] above which the command warns that other programs disturb it."""
 
 
 def command(
@@ -86,7 +86,7 @@ def command(
 
 
 def _profile(resolved: Resolved, preset: Path | None, seconds: float) -> None:
-    """Print the table of `--profile`: where the time of an environment step goes."""
+    """Print the table of `--profile`: the time that each part of an environment step takes."""
     if preset is not None:
         raise UsageError(
             "--profile recommends no settings that --save-preset could write",
@@ -155,7 +155,7 @@ def _report(
 
 
 def _preset_file(name: str, overwrite: bool) -> Path:
-    """Return the file of the preset: FILE, or NAME.yaml in the current folder.
+    """Return the path of the YAML file that --save-preset writes: FILE, or NAME.yaml in the current folder.
 
     Raises:
         UsageError: if the file exists and may not be replaced.

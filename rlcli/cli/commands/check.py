@@ -27,8 +27,8 @@ def command(
 
     Options:
         only: Run only the check with this name; repeatable.
-        record: Write the columns of observations and actions to task.layout.json in the task's folder, with which the
-            check `layout` compares them from then on.
+        record: Write the names of all observation and action columns to task.layout.json in the task's folder. From
+            then on, the check `layout` compares the task with this file.
 
     Examples:
         rlcli check cartpole

@@ -1,4 +1,4 @@
-"""`rlcli diff`: the first difference of two runs, or all differences of two configurations."""
+"""`rlcli diff`: comparison of two runs (where they differ first) or of two configurations (all differences)."""
 
 from __future__ import annotations
 
@@ -136,7 +136,7 @@ def _compare_configurations(one: Resolved | Run, other: Resolved | Run, left: Si
     values, files = [], []
     for side, opposite in ((one, other), (other, one)):
         found = run_values(side) if isinstance(side, Run) else task_values(side)
-        if not isinstance(opposite, Run):  # only a run has a seed
+        if not isinstance(opposite, Run):  # a task has no seed to compare with
             found.pop(("seed",), None)
         values.append(found)
         digests = side.record.get("sources") if isinstance(side, Run) else sources(side)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rlcli.runs.run import Run
 
 _MAX_KEYS = 10
-"""Largest number of keys that --verify prints if the metadata of the exported file differs from the task."""
+"""Number of metadata keys that --verify prints at most, of those whose values differ from the task's."""
 
 
 def command(
@@ -75,7 +75,10 @@ def command(
 
 
 def _print_exported(done: Exported) -> None:
-    """Print how exactly an exported file equals the policy; warn of terms that only the task's code can compute."""
+    """Print the largest difference between the actions of the exported file and of the policy.
+
+    Also warn of observation and action terms that only the task's code can compute.
+    """
     from rlcli.deploy.metadata import terms_of_task_code
 
     limit = f"difference <= {done.max_difference:.1e}"
@@ -173,9 +176,10 @@ def _export_bundle(saved: Checkpoint, run: Run | None, output: Path) -> None:
 
 
 def _find(reference: str | None, runs_dir: Path, task: str | None) -> Choice:
-    """Return the checkpoint that --checkpoint or the task names, and why; its folder may be outside of a run.
+    """Return the checkpoint to export, and the reason for this choice; its folder may be outside of a run.
 
-    The task's code is only imported if the task has no run: a trained policy is exported without it.
+    Either --checkpoint names it, or the task does: then its newest run is used. The task's code is imported only if
+    the task has no run, because a trained policy is exported without this code.
     """
     from rlcli.evaluation.session import named_task_or_run
     from rlcli.runs.policy_bundle import is_bundle

@@ -134,7 +134,7 @@ def _create_run(
 
 
 def _importer(form: str, convert: Callable[..., Imported]) -> Callable[..., None]:
-    """Return the command `rlcli import NAME` of a format's plugin, with the options and help of its import function."""
+    """Return the command `rlcli import NAME` for a task format; its options and help are those of `convert`."""
 
     @functools.wraps(convert)
     def command(**values: Any) -> None:

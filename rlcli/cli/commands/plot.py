@@ -1,4 +1,4 @@
-"""`rlcli plot`: learning curves of runs; runs that differ only in their seed share a curve."""
+"""`rlcli plot`: picture with learning curves; runs that differ only in their seed become one curve."""
 
 from __future__ import annotations
 

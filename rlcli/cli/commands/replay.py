@@ -61,7 +61,7 @@ def command(
 
 
 def _print_episodes(trajectory: Trajectory, result: Replay, episodes: int, video: Path | None, frames: int) -> None:
-    """Print how the replay of a recording (`--record`) ended."""
+    """Print whether the replayed episodes of a recording (`--record`) equal the recorded ones, bit by bit."""
     difference, values = result.difference, None
     text = f"episodes: {episodes}, steps: {result.steps}; equal bit by bit"
     if difference is not None:
@@ -76,7 +76,7 @@ def _print_episodes(trajectory: Trajectory, result: Replay, episodes: int, video
 
 
 def _print_calls(trajectory: Trajectory, result: Replay) -> None:
-    """Print how the replay of a crash dump or failure case ended, for each environment in it."""
+    """Print, for each environment of a crash dump or failure case, whether the replay equals the file bit by bit."""
     from rlcli.runs.atomic_io import finite_json
 
     header = trajectory.header

@@ -75,8 +75,8 @@ def _add_media(page: Page, run: Run, checkpoint: Path | None, *, no_eval: bool, 
     """Add evaluation and video to the page.
 
     Returns:
-        For the evaluation and the video where it comes from: `stored` (a file of the run), `made` (now), `older` (a
-        file of an earlier checkpoint), or an empty text (the page has none).
+        The origin of the evaluation and the origin of the video. Each is `stored` (a file of the run), `made` (by
+        this call), `older` (a file of an earlier checkpoint) or an empty text (the page has none).
     """
     from rlcli.reporting.page_evaluation import PageMedia
 

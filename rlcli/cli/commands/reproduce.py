@@ -1,4 +1,7 @@
-"""`rlcli reproduce`: compare versions and machine with those of a run, train it again, compare the results."""
+"""`rlcli reproduce`: repetition of a training, whose metrics and weights must equal those of the original run.
+
+First the command compares the versions of software and the machine with those that the run has recorded.
+"""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ _COLUMNS = [
     "REMARK",
 ]  # fmt: skip
 _MAX_REMARK = 60
-"""Longest remark [characters]."""
+"""Largest length of a text in the column REMARK [characters]."""
 
 
 def command(
@@ -87,9 +87,10 @@ def _row(run: Overview, runs_dir: Path) -> list[str]:
 
 
 def _tags(run: Overview) -> str:
-    """Return the text of the column REMARK: the device if it is not the CPU, the number of processes if it is above 1.
+    """Return the text of a run's column REMARK.
 
-    It ends with `from weights` if the training started with the weights of a checkpoint (--init-from).
+    It has the device if this is not the CPU, the number of processes if this is above 1, and `from weights` if the
+    training started with the weights of a checkpoint (--init-from).
     """
     tags = []
     if (device := str(run.tags.get("device", "cpu"))) != "cpu":

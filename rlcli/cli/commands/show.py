@@ -1,4 +1,4 @@
-"""`rlcli show`: the resolved configuration of a task, the origin of its values, or its JSON Schema."""
+"""`rlcli show`: printout of a task's resolved configuration, of the origin of each value, or of the JSON Schema."""
 
 import json as json_module
 from typing import Annotated

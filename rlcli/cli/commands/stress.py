@@ -108,7 +108,7 @@ def _read_sweeps(texts: list[str] | None, points: int) -> list[Sweep]:
 
 
 def _resolve_run(request: PolicyRequest) -> PolicyRequest:
-    """Return the request, with a run that was typed as the first argument (`RUN|TASK`) as its checkpoint.
+    """Return the request with its checkpoint filled in if the first argument (`RUN|TASK`) is a run.
 
     Raises:
         UsageError: if --checkpoint is given too.

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 _READ_OPTIONS = {"task", "overrides", "storage", "runs_dir", "json", "quiet", "verbose", "debug"}
 _COMPARE_OPTIONS = {"seeds", "until", "episodes", "max_iterations", "max_steps", "device"}
 _OPTIONS = {"show": _READ_OPTIONS | {"plot"}, "compare": _READ_OPTIONS | _COMPARE_OPTIONS}
-"""Options of `sweep show` and `sweep compare`."""
+"""Subcommand (`show` or `compare`) -> the options that it takes."""
 _NOT_OF_A_SWEEP = {"plot": "sweep show", "seeds": "sweep compare", "until": "sweep compare"}
-"""Option that a new sweep does not take -> the command that takes it."""
+"""Option that cannot be used when a new sweep is started -> the command that has this option."""
 
 
 def command(
@@ -177,10 +177,10 @@ def _search(
 
 
 def _check_options(ctx: typer.Context, task: str | None) -> None:
-    """Check that every given option is an option of what was typed: a new sweep, `sweep show` or `sweep compare`.
+    """Check that all given options fit the form of the command: `sweep TASK`, `sweep show` or `sweep compare`.
 
     Raises:
-        UsageError: with the first option that is not, or for an unknown --pruner.
+        UsageError: with the first option that does not fit, or for an unknown --pruner.
     """
     sources = {name: ctx.get_parameter_source(name) for name in ctx.params}
     given = [name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"]

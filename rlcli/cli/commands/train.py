@@ -219,7 +219,7 @@ def _print(result: TrainingResult) -> None:
 
 
 def _next_steps(result: TrainingResult) -> list[str]:
-    """Return what the last success rate or return of the training counts, and how to find out whether it is good."""
+    """Return messages that explain the last success rate or return, and name commands that judge the policy."""
     success, mean_return = (result.metrics.get(f"Train/{name}") for name in ("success_rate", "mean_reward"))
     if mean_return is None:
         return []

@@ -1,4 +1,4 @@
-"""`rlcli watch`: follow a training that runs in another terminal, from the files of its run."""
+"""`rlcli watch`: live view of a training that runs in another terminal; reads only the files of its run."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def _follow(run: Run) -> Overview:
     with TrainingView(f"rlcli train {run.record['task']['name']}") as view:
         while True:
             state, _ = state_of(run)
-            progress = _progress(run)  # after the state, so that the last rows of an ended run are read
+            progress = _progress(run)  # read after the state: if the run has ended, its last rows are written by now
             if progress is not None and (progress.iteration, progress.env_steps) != printed:
                 printed = progress.iteration, progress.env_steps
                 view.show(progress)
@@ -64,7 +64,7 @@ def _follow(run: Run) -> Overview:
             try:
                 run = open_run(run.folder)
             except CheckpointError:
-                if not run.folder.exists():  # a run that fails before its first iteration is removed
+                if not run.folder.exists():  # rlcli removes the folder of a run that fails in its first iteration
                     raise
         return overview_of(open_run(run.folder))
 

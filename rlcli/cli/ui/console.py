@@ -22,15 +22,15 @@ if TYPE_CHECKING:
 
 SCHEMA_VERSION = 1
 _ERRORS_OF_ONE_RANK = ("bug", "device", "diverged")
-"""Values of `RlcliError.kind` of errors that may happen on one rank only, so that every rank prints them."""
+"""Kinds of errors (`RlcliError.kind`) that every rank prints, because they may happen on one rank only."""
 _ESCAPED = re.compile(f"{UNSAFE.pattern}|[\t\n]")
 _NO_READER = (errno.EPIPE, errno.EIO)
-"""Errors of writing to a pipe without a reader, and to a terminal that was closed."""
+"""Error numbers of a failed write because the pipe has no reader or the terminal was closed."""
 
 
 @dataclass(slots=True)
 class Console:
-    """Output of one command: data, messages and the JSON document, according to its flags."""
+    """Writer for the output of a command: data, messages and the JSON document, as --json, -q and -v demand."""
 
     json: bool = False
     quiet: bool = False
@@ -39,13 +39,13 @@ class Console:
     muted: bool = False
     """Whether this process is a rank other than 0, which prints only its own errors: rank 0 prints the rest."""
     owns_process: bool = False
-    """Whether the process was started for this command and ends with it."""
+    """Whether this process runs only this command; False if Python code has called `main(arguments)`."""
     has_document: bool = False
     """Whether the JSON document is printed; an error after that, such as Ctrl-C, prints no second one."""
     has_line: bool = False
-    """Whether the last line of the terminal shows the progress of some work; other output overwrites this line."""
+    """Whether the last line of the terminal shows progress; further output first erases this line."""
     out: Any = None
-    """Stream of the JSON document; None is stdout."""
+    """Stream to which the JSON document is written; None means stdout."""
 
     @contextlib.contextmanager
     def stdout_kept(self) -> Iterator[None]:
@@ -192,7 +192,7 @@ def output_error(error: OSError) -> MachineError:
 
 
 def redirect_to_null(stream: Any) -> None:
-    """Redirect a broken stream to the null device, so that nothing fails when Python flushes it at exit."""
+    """Redirect a broken stream to the null device: Python flushes the stream at exit, which would fail otherwise."""
     with contextlib.suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 

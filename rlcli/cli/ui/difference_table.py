@@ -14,9 +14,9 @@ if TYPE_CHECKING:
     from rlcli.runs.config_diff import Difference, Section
 
 _MAX_ROWS = 10
-"""Largest number of differences of one kind (physics, MDP, agent, cosmetic, or a section) in the table without -v."""
+"""Number of rows that one kind of difference, such as physics or MDP, has at most; with -v there is no limit."""
 _WIDTH = 40
-"""Longest cell [characters]."""
+"""Largest length of a cell [characters]."""
 
 
 def report_differences(command: str, sections: Sequence[Section], left: str, right: str, **entries: Any) -> bool:

@@ -86,7 +86,7 @@ def show_stress(result: StressResult, against: str | None) -> None:
 
 
 def interval(entry: Mapping[str, Any]) -> str:
-    """Return the 95 % interval of a mean or a rate in an evaluation as text."""
+    """Return the 95 % confidence interval of one result of an evaluation (a mean or a rate) as text."""
     return "unknown" if entry["low"] is None else f"{entry['low']:.4f} .. {entry['high']:.4f}"
 
 
@@ -97,6 +97,9 @@ def _cells(entry: Mapping[str, Any]) -> list[str]:
 
 
 def _labels(names: Sequence[str]) -> Sequence[str]:
-    """Return short names of the compared policies: the last part of each path, if these parts differ."""
+    """Return short names of the compared policies.
+
+    They are the last parts of the paths if all last parts differ, else the whole paths.
+    """
     short = [Path(name).name or name for name in names]
     return short if len(set(short)) == len(set(names)) else names

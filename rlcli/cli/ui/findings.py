@@ -1,4 +1,4 @@
-"""Report of `check` and `lint`: a table of results, the findings, the JSON document and the exit code."""
+"""Output of `rlcli check` and `rlcli lint`: a table of results, the findings, the JSON document, the exit code."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Text of `--help`: commands and options in panels, and examples; plain text, because rich is slow to import."""
+"""Formatter of `--help`: commands and options in titled panels, and examples.
+
+The help is plain text, because rich, which typer would use, is slow to import.
+"""
 
 import inspect
 import re
@@ -104,7 +107,7 @@ def _name(parameter: Any) -> str:
 
 
 def _description(parameter: Any) -> str:
-    """Return the second column of the help: the text, the range and the default (also if the text names it)."""
+    """Return the second column of the help: the help text, the allowed range and the default value."""
     found = re.fullmatch(r"(.*?)(?: \[default: (.+)\])?", parameter.help or "", re.DOTALL)
     assert found is not None
     default = found[2] or (None if isinstance(parameter.default, bool) else parameter.default)

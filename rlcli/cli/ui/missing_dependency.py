@@ -25,4 +25,4 @@ def missing_dependency(error: BaseException) -> DependencyError | None:
 
 
 _DISTRIBUTIONS = {"yaml": "pyyaml", "warp": "warp-lang", "mlflow": "mlflow-skinny"}
-"""Module -> distribution, where the names differ."""
+"""Name of an imported module -> name of the package that pip installs, where the two differ."""

@@ -1,4 +1,4 @@
-"""Choice of the viewer that `play` opens, and the JSON document after the viewer is closed."""
+"""Choice and opening of the viewer for `rlcli play`; afterwards the JSON document is printed."""
 
 from __future__ import annotations
 

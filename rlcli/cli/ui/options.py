@@ -21,7 +21,7 @@ from rlcli.registry.task_code_monitor import raised_by_task
 from rlcli.safe_text import MAX_SEED, read_number
 
 CHOOSE = "auto"
-"""Value of an option that is given without its value (`--video`)."""
+"""Text that the parser stores for an option such as `--video` if the user gives no value for it."""
 
 
 def choice(metavar: str, *names: str, help: str | None = None) -> Any:
@@ -112,11 +112,11 @@ _NEEDED = {
     "episodes": ("verify", "--verify"),
     "steps": ("case", "the number of a recorded episode"),
 }
-"""Option -> the parameter without which a command ignores it, and how the user writes that parameter."""
+"""Option -> another parameter that it needs to have an effect, and how the user writes that parameter."""
 
 
 TYPER_ERRORS = (OSError, EOFError, typer.Exit, typer.Abort, typer.BadParameter)
-"""Exceptions that typer takes for its own; code of a task may raise them, too."""
+"""Exceptions that typer handles itself, without a message of rlcli. The code of a task may raise them, too."""
 
 
 class BodyError(Exception):
@@ -276,7 +276,7 @@ def check_output(output: Path | None, what: str, suffixes: Sequence[str]) -> Non
 
 
 def exit_on_failures(failures: list[str]) -> None:
-    """Print the failed limits of --fail-under and --fail-over; exit with code 9 if there are any."""
+    """Print the limits (--fail-under, --fail-over) that a result violates; exit with code 9 if there are any."""
     for failure in failures:
         console.info(f"failed: {failure}")
     if failures:

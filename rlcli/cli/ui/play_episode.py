@@ -1,4 +1,7 @@
-"""`rlcli play --env E --episode K`: repeat one episode of an evaluation in a viewer, video, recording or table."""
+"""Repetition of one episode of an evaluation, for `rlcli play --env E --episode K`.
+
+The episode is shown in a viewer, filmed, recorded, or printed as a table.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +25,7 @@ if TYPE_CHECKING:
     from rlcli.viewer.video_writer import VideoWriter
 
 _MAX_REASONS = 6
-"""Largest number of reasons in the message that says why earlier episodes of the environment were run first."""
+"""Number of reasons that one message lists at most; they say why earlier episodes had to be run first."""
 
 
 def check_choice(
@@ -119,9 +122,10 @@ def _print_origin(session: Session, start: EpisodeStart, env_id: int, episode: i
 
 
 def _origin(session: Session, start: EpisodeStart, env_id: int, episode: int) -> dict[str, Any]:
-    """Return which episode was repeated, as JSON data; warn if it is only repeatable with the same --num-envs.
+    """Return JSON data that identify the repeated episode; warn if it depends on the number of environments.
 
-    Call this after the episode has run: only then it is known whether the task used a shared random generator.
+    An episode depends on --num-envs if the task draws from a random generator that all environments share. Whether
+    it does is known only after the episode: call this function then.
     """
     shared = start.shared_draws()
     if shared:
@@ -139,7 +143,7 @@ def _origin(session: Session, start: EpisodeStart, env_id: int, episode: int) ->
 
 @dataclass(slots=True)
 class FilmedPolicy:
-    """Policy that also renders its environment into a video, once every `stride` steps, before it acts."""
+    """Wrapper around a policy that renders a video frame every `stride` steps, before the policy acts."""
 
     session: Session
     env_id: int

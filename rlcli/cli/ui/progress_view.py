@@ -1,4 +1,4 @@
-"""Views of running work: a live block on a terminal, else a line every few seconds."""
+"""Views that show the progress of a command or a training: a live block on a terminal, else a line now and then."""
 
 import contextlib
 import sys
@@ -16,7 +16,7 @@ from rlcli.training.progress import PARTS, Progress
 LINE_EVERY_S = 5.0
 _WORK_LINE_EVERY_S = 10.0
 _WORK_AFTER_S = 1.4
-"""Time after which running work is shown on a terminal [s]; shorter work is not shown."""
+"""Time after which the progress of work is shown on a terminal [s]; work that ends earlier shows none."""
 _REDRAW_EVERY_S = 0.25
 _MIN_SHARE, _MIN_ELAPSED_S = 0.2, 30.0
 """The time left is shown when this share of the work is done or this time [s] has passed.
@@ -26,7 +26,7 @@ Earlier estimates are too long, because the first parts include imports and comp
 _MAX_ROWS = 100
 """Rows of one table; an untrusted run may have any number of metrics."""
 _MAX_S = 1e10
-"""Longest time that is shown [s]."""
+"""Largest duration that is printed [s]; a longer one is printed as this limit."""
 _LINE_METRICS = (
     ("Train/mean_reward", "return", ".3f"),
     ("Train/mean_episode_length", "length", ".0f"),
@@ -127,7 +127,7 @@ def work_line(running: Sequence[Work]) -> str:
     if share > 0.0:
         counts.append(f"{share:.0%}")
     if share >= _MIN_SHARE or (share > 0.0 and elapsed >= _MIN_ELAPSED_S):
-        # estimated when a part ended, and counted down since; a part that takes longer than that has no estimate
+        # the estimate dates from the end of the last part, minus the time since; below 0 it was wrong and is not shown
         left = elapsed * (1.0 - share) / share - (now - changed)
         if left >= 0.0:
             return f"{title}{', '.join(counts)}, {duration_text(left)} left"
@@ -136,7 +136,7 @@ def work_line(running: Sequence[Work]) -> str:
 
 
 def _share(nested: Sequence[Work]) -> float:
-    """Return the share of the outermost work that is done, 0 to 1.
+    """Return the fraction of the outermost work that is done, 0 to 1.
 
     `nested` begins with the outermost work; each further work is one of the parts that the work before it counts.
     """

@@ -78,7 +78,10 @@ def draw_map(
 
 
 def _block(columns: Sequence[str], row: Sequence[str], width: int) -> list[Any]:
-    """Return a row of a table as a block of lines: the first cell, then `COLUMN cell` for other cells with content."""
+    """Return a row of a table as a block of lines for a narrow terminal.
+
+    The first line is the first cell; below it, each other cell that has content follows the name of its column.
+    """
     from rich.text import Text
 
     first, *others = (f"{name} {cell}".strip() for name, cell in zip(columns, row, strict=True))

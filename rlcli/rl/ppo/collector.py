@@ -52,7 +52,7 @@ class Collector:
         self.checks_every_stage = device.type == "cpu"
         """Whether tensors are checked for NaN after every stage.
 
-        On a GPU, check once per iteration: each check forces a host sync."""
+        True on a CPU. On a GPU tensors are checked only once per iteration, because each check waits for the GPU."""
         groups = networks.critic_groups
         self._critic_reads_actor_obs = groups == ("policy",)
         obs_size, critic_size = layout.size("policy"), sum(layout.size(group) for group in groups)
@@ -209,7 +209,7 @@ class Collector:
         return value, last_value, self._value_where(rollout.time_out, rollout.final_obs)
 
     def _recurrent_values(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the same as `_values` for a critic with an LSTM, and advance the LSTM's hidden state."""
+        """Return the values that `_values` describes, for a critic with an LSTM; advance its hidden state."""
         lstm, state, rollout = self.networks.critic_memory, self.hidden_state["critic"], self.rollout
         assert lstm is not None
         features, states = unroll(lstm, rollout.samples.critic_obs, rollout.samples.episode_start, state)
@@ -275,7 +275,7 @@ class Collector:
             self._update_normalizer(self.critic_normalizer, self._concatenated(obs).flatten(0, -2))
 
     def _update_normalizer(self, normalizer: Normalizer, values: Tensor) -> None:
-        """Merge the batches of all processes into a normaliser. (n, ...)"""
+        """Update a normaliser with this process's values and, in a group, with those of all others. (n, ...)"""
         batch, processes = values.double(), self.process_group.world_size
         mean, var = batch.mean(dim=0), batch.var(dim=0, unbiased=False)
         if processes > 1:

@@ -36,7 +36,7 @@ def compile_update(
     compile_ = functools.partial(torch.compile, fullgraph=True, dynamic=False, mode=mode)
     compiled = UpdateFunctions(*map(compile_, functions))
     try:
-        with warnings.catch_warnings(action="ignore"):  # the compiler advises the authors of the code
+        with warnings.catch_warnings(action="ignore"):  # its warnings are advice for rlcli's authors
             warm_up(compiled)
     except (RuntimeError, ImportError, OSError) as error:
         reason = next(iter(str(error).strip().splitlines()), "")

@@ -1,4 +1,7 @@
-"""Settings of the built-in PPO trainer. The module does not import torch, so that a YAML is checked fast."""
+"""Settings (agent keys) of the built-in PPO trainer, as pydantic models.
+
+The module does not import torch, so that a task's YAML file is checked fast.
+"""
 
 from __future__ import annotations
 
@@ -112,8 +115,8 @@ class PpoConfig(AgentConfig):
     clip_range: Positive = 0.2
     """Clipping range of the probability ratio: 1 +- clip_range."""
     clip_value: Literal["larger", "clipped"] | None = "larger"
-    """Squared error in the value loss. clipped: the error of the value, clipped to old value +- clip_value_range.
-    larger: the larger one of the clipped and the plain error. null: the plain error."""
+    """Squared error in the value loss. null: the error of the critic's value. clipped: the error after the value is
+    clipped to the range old value +- clip_value_range. larger: the larger one of these two errors."""
     clip_value_range: Positive | None = None
     """Clipping range of the change of the value; null: clip_range."""
     value_coef: NotNegative = 1.0
@@ -222,7 +225,7 @@ class PpoConfig(AgentConfig):
 
 
 DIALECTS: Mapping[str, Mapping[str, Any]] = load(Path(__file__).with_name("dialects.yaml").read_bytes()).data
-"""Dialect -> its defaults where they differ from those of `PpoConfig`."""
+"""Dialect (library whose defaults are used) -> settings whose defaults differ from those of `PpoConfig`."""
 
 SPEC = TrainerSpec(
     summary="Built-in PPO in torch; on a GPU it runs as CUDA graphs",
@@ -234,10 +237,10 @@ SPEC = TrainerSpec(
 
 
 def _lists_to_tuples(value: object) -> Any:
-    """Return JSON data with tuples for lists.
+    """Return JSON data in which all lists are replaced by tuples.
 
-    A tuple field accepts a list from a YAML file, but not in the output of a validator, which is checked strictly as
-    Python data.
+    pydantic accepts a list from a YAML file for a field whose type is a tuple. The output of a validator is checked
+    more strictly: there the value must already be a tuple.
     """
     if isinstance(value, dict):
         return {key: _lists_to_tuples(item) for key, item in value.items()}

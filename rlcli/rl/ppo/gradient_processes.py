@@ -1,4 +1,4 @@
-"""Gradients of MLPs, computed by the worker processes of the environment, which are idle between two rollouts.
+"""Computation of MLP gradients by the worker processes that step the environment, which are idle between rollouts.
 
 Python runs one thread at a time, so that more than about eight threads of one process slow each other down. A
 minibatch is split and summed as in `rlcli.rl.mlp_gradients.MlpGradients`, so the results are bit-identical.
@@ -28,7 +28,7 @@ from rlcli.rl.ppo.rollout_buffer import RolloutBuffer, Samples
 def distributed_gradients(
     env: ShardedEnv, networks: ActorCritic, weights: Tensor, config: PpoConfig, rollout: RolloutBuffer
 ) -> Callable[[Sequence[Tensor]], LayerGradients]:
-    """Return a factory of `LayerGradients` that are computed by the processes of an environment.
+    """Return a factory of functions (`LayerGradients`) that compute gradients in the environment's worker processes.
 
     Args:
         env: the environment.
@@ -86,8 +86,11 @@ class _Job:
     """Number of samples of the largest minibatch."""
 
 
-class _Share:
-    """Gradient computation of one of n processes: every n-th part of a minibatch, in shared memory."""
+class _ProcessGradients:
+    """Gradient computation of one process: of n processes, each computes every n-th part of a minibatch.
+
+    Samples and gradients are in memory that all processes share.
+    """
 
     def __init__(self, env: VecEnv, job: _Job) -> None:
         tensors = {name.removeprefix("gradient."): tensor for name, tensor in env.shard.shared.items()}
@@ -112,11 +115,11 @@ class _Share:
             self._parts.compute(task, inputs, gradients)
 
 
-_shares: WeakKeyDictionary[VecEnv, _Share] = WeakKeyDictionary()
+_shares: WeakKeyDictionary[VecEnv, _ProcessGradients] = WeakKeyDictionary()
 
 
 def _prepare(env: VecEnv, job: _Job) -> None:
-    _shares[env] = _Share(env, job)
+    _shares[env] = _ProcessGradients(env, job)
 
 
 def _compute(env: VecEnv, number: int) -> None:

@@ -54,7 +54,7 @@ class Learner:
         self.optimizer = adam(self.weights, self.learning_rate, config.adam_eps)
 
         self._kl_sum = torch.zeros((), device=device)
-        """Sum of the KL divergences of the minibatches in the current epoch."""
+        """KL divergences between old and new policy, summed over the minibatches of the current epoch. (scalar)"""
         self._metric_sums = torch.zeros(len(METRICS), device=device)
         self.metric_values = torch.zeros(len(METRICS) + 4, device=device)
         """`METRICS`, then mean action std, learning rate, 1 if all weights are finite, explained variance. (11,)"""
@@ -62,7 +62,7 @@ class Learner:
         self._tf32 = config.tf32 and device.type == "cuda"
         self.functions = UpdateFunctions()
         self.torch_threads = torch_threads
-        """Threads of torch in `update`: one with the closed-form gradient, which has its own threads."""
+        """Number of torch's threads in `update`; 1 with the closed-form gradient, which starts its own threads."""
         self.minibatch_gradient: MinibatchGradient
         mode = compile_mode(config, device, self._samples_per_rollout * process_group.world_size)
         if mode:
@@ -75,7 +75,10 @@ class Learner:
             self.minibatch_gradient = AutogradGradient(self._networks, self.gradient_and_kl, self.functions.loss)
 
     def _gradient_computation(self, threads: int) -> MakeLayerGradients:
-        """Return a factory of `LayerGradients`, computed by the processes of the environment or by threads."""
+        """Return a factory of `LayerGradients`.
+
+        The environment's worker processes compute them if it has several, else threads of this process do.
+        """
         env, rollout = self.collector.env, self.collector.rollout
         if env.workers > 1:
             from rlcli.envs.sharding.env import ShardedEnv
@@ -188,7 +191,7 @@ class Learner:
             self.functions.adapt_learning_rate_(self.learning_rate, self._rate_ceiling, kl, self.config)
 
     def _call_all(self, functions: UpdateFunctions) -> None:
-        """Call the functions of an update once with each minibatch size, so that torch compiles them."""
+        """Call each function once with every minibatch size, so that torch compiles it for these sizes."""
         gradient = AutogradGradient(self._networks, self.gradient_and_kl, functions.loss)
         minibatches = self.collector.rollout.minibatches
         with tf32_matmul(self._tf32):

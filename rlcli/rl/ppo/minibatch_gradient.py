@@ -50,7 +50,7 @@ MakeLayerGradients = Callable[[Sequence[Tensor]], LayerGradients]
 
 
 def threaded_gradients(networks: ActorCritic, rows: int, threads: int) -> MakeLayerGradients:
-    """Return a factory of `LayerGradients` that are computed by threads of this process."""
+    """Return a factory of functions (`LayerGradients`) that compute gradients in threads of this process."""
 
     def make(gradients: Sequence[Tensor]) -> LayerGradients:
         mlps = MlpGradients(networks.actor, networks.critic, gradients, rows, threads)

@@ -22,7 +22,7 @@ _POLICY = ("memory.", "vision.", "actor.")
 _MIN_STD = 1e-6
 _VALUE_CLIP = 5.0
 _VALUE_EPS = 1e-5
-"""As in rl_games: normalised values are clipped to +-5, and epsilon is added to the variance."""
+"""Normalised values are clipped to +-5 and 1e-5 is added to their variance, as in rl_games."""
 
 
 class ActorCritic(nn.Module):
@@ -95,7 +95,7 @@ class ActorCritic(nn.Module):
         return (image - (own.index_select(1, self.mirror_index) * self.mirror_sign).detach()).square().mean()
 
     def value(self, critic_obs: Tensor) -> Tensor:
-        """Return the value. (..., c) -> (...)"""
+        """Return the critic's value, normalised if the agent normalises values. (..., c) -> (...)"""
         value: Tensor
         if self.critic_vision is not None:
             *rows, _ = critic_obs.shape
@@ -154,11 +154,11 @@ class ValueNormalizer(Normalizer):
         self.count.fill_(1.0)
 
     def forward(self, value: Tensor) -> Tensor:
-        """Return `value`, discounted returns, normalised by their running mean and std, and clipped."""
+        """Return discounted returns normalised by their running mean and standard deviation, and clipped."""
         return ((value - self.mean.float()) / self._std).clamp(-_VALUE_CLIP, _VALUE_CLIP)
 
     def inverse(self, value: Tensor) -> Tensor:
-        """Return the discounted returns for normalised values, which are clipped first: the inverse of `forward`."""
+        """Return the discounted returns that belong to normalised values: clip the values, then invert `forward`."""
         return value.clamp(-_VALUE_CLIP, _VALUE_CLIP) * self._std + self.mean.float()
 
     @property
@@ -186,7 +186,7 @@ def flatten(module: nn.Module) -> tuple[nn.Parameter, Tensor, dict[str, slice]]:
 
 
 def adam(vector: nn.Parameter, learning_rate: Tensor, eps: float) -> Adam:
-    """Return an Adam optimiser with allocated state: a step inside a CUDA graph must not allocate it."""
+    """Return an Adam optimiser whose state is already allocated: inside a CUDA graph nothing may be allocated."""
     optimizer = Adam([vector], lr=learning_rate, eps=eps, fused=True, capturable=vector.is_cuda)
     optimizer.step()  # the gradient is zero: no parameter changes
     optimizer.state[vector]["step"].zero_()

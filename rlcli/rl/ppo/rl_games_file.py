@@ -1,7 +1,7 @@
-"""Reader of an rl_games configuration (its mapping `params`), which becomes settings of the trainer `ppo`.
+"""Translation of an rl_games configuration (its mapping `params`) into settings of the trainer `ppo`.
 
-Isaac Lab and OmniIsaacGymEnvs have such configurations. The setting `dialect: rl_games` gives settings that the file
-lacks the defaults of rl_games. The module imports no torch.
+Isaac Lab and OmniIsaacGymEnvs have such configurations. Settings that the file does not mention get the defaults of
+rl_games, through the setting `dialect: rl_games`. The module does not import torch.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from rlcli.formats import Status
 
 
 class Sink(Protocol):
-    """Receiver of the settings, notes and mistakes of a reader.
+    """Interface of the object that receives settings, notes and mistakes while a configuration is read.
 
     `source` and `path` are places in the file, as keys: ("params", "config", "gamma"). `target` is a key of `ppo`.
     """
@@ -295,7 +295,7 @@ class RlGamesReader:
 
 
 def _no_counterpart(value: object) -> str:
-    """Return the note for a setting whose value rlcli cannot represent, or which has no value."""
+    """Return the note for an rl_games setting that has no value or a value that rlcli cannot represent."""
     return "the key has no value" if value is None else f"'{value}' has no counterpart in rlcli"
 
 

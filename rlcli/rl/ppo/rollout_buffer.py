@@ -13,7 +13,10 @@ from rlcli.sim.state_cache import is_finite
 
 @dataclass(frozen=True, slots=True)
 class Samples:
-    """Samples of a rollout: columns of one packed tensor, so that one gather makes a minibatch. (..., d) or (...)"""
+    """Samples of a rollout. All fields are columns of one packed tensor. (..., d) or (...)
+
+    One gather operation on the packed tensor therefore fills a minibatch.
+    """
 
     obs: Tensor
     """Normalised observation of the actor."""
@@ -114,9 +117,9 @@ class RolloutBuffer:
         return is_finite(self._packed)
 
     def in_causal_order(self) -> list[tuple[str, Tensor]]:
-        """Return (name, tensor) of all samples, each after the tensors from which it is computed, for `require_finite`.
+        """Return (name, tensor) of all samples for `require_finite`, in the order in which they are computed.
 
-        (num_steps, num_envs, ...) each
+        Each tensor comes after those that it is computed from. (num_steps, num_envs, ...) each
         """
         samples = self.samples
         final_obs = torch.where(self.time_out[..., None], self.final_obs, 0.0)

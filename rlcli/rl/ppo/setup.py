@@ -1,4 +1,7 @@
-"""Structure of the PPO trainer for a configuration and an environment: policy, CNN, critic groups, minibatch sizes."""
+"""Functions that derive the parts of the PPO trainer from its settings and the environment.
+
+The parts are the structure of policy and CNN, the observation groups of the critic, and the minibatch sizes.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,10 @@ from rlcli.rl.ppo.config import PpoConfig
 from rlcli.rl.trainer_base import agent_error
 
 _WORTH_COMPILING = 40_000
-"""Compiling saves time on a GPU from this number of minibatch updates in a run (docs/explanation/benchmarks.md)."""
+"""Number of minibatch updates in a run above which compiling them saves time on a GPU.
+
+It is measured in docs/explanation/benchmarks.md.
+"""
 
 
 def policy_spec(env: Environment, config: PpoConfig) -> PolicySpec:

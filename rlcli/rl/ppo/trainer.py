@@ -132,7 +132,11 @@ class PpoTrainer(BaseTrainer):
         return TrainerState(tensors, values)
 
     def _process_state(self) -> tuple[dict[str, Tensor], dict[str, Tensor], dict[str, Any]]:
-        """Return the state that differs between processes: environments, random generators, statistics."""
+        """Return the part of the state that each process saves for itself: environments, random generators, statistics.
+
+        Returns:
+            Tensors of environments and rollouts; states of the random generators; sums of the episode statistics.
+        """
         rng = rng_state()
         if self.device.type == "cuda":
             rng["cuda"] = torch.cuda.get_rng_state(self.device)

@@ -21,7 +21,7 @@ class TorchRolloutBuffer(RolloutBuffer):
     """SB3's rollout buffer with torch storage. All tensors are (n_steps, n_envs, ...)."""
 
     num_minibatches: int | None = None
-    """Number of minibatches of `get`, which are as even as possible; None: minibatches of `batch_size` samples."""
+    """Number of minibatches that `get` yields, of nearly equal size; None: minibatches of `batch_size` samples."""
 
     def reset(self) -> None:
         """Discard the rollout. The first call allocates the storage."""
@@ -93,7 +93,7 @@ class TorchReplayBuffer(ReplayBuffer):
         self.reward = torch.zeros(rows, envs, 1)
         self.done = torch.zeros(rows, envs, 1)
         self.added = 0
-        """Number of steps ever stored."""
+        """Number of steps stored since the start of the training, including overwritten ones."""
 
     def put(self, obs: Tensor, next_obs: Tensor, action: Tensor, reward: Tensor, done: Tensor) -> None:
         """Store one step of every environment. (n_envs, ...) each"""
@@ -116,8 +116,8 @@ class TorchReplayBuffer(ReplayBuffer):
         """Return the stored rows for a checkpoint.
 
         Args:
-            at_risk: number of steps that may be stored before the rows are read. The rows that these steps would
-                overwrite are copied.
+            at_risk: number of steps that the training may store before the checkpoint reads the rows. The rows that
+                these steps would overwrite are copied now.
         """
         first, stop = max(0, self.added - self.buffer_size), self.added
         overwritten = max(0, stop + at_risk - self.buffer_size - first)

@@ -1,4 +1,7 @@
-"""Settings of the Stable-Baselines3 trainer. The module does not import the library: a YAML is checked fast."""
+"""Settings (agent keys) of the trainer `sb3` (Stable-Baselines3), as pydantic models.
+
+The module does not import Stable-Baselines3, so that a task's YAML file is checked fast.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""SB3's algorithm object and the structure of the policy, for a configuration and an environment."""
+"""Functions that create SB3's algorithm object, and the structure of its policy, from settings and an environment."""
 
 from __future__ import annotations
 

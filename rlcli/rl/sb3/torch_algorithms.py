@@ -1,6 +1,7 @@
-"""Stable-Baselines3's algorithms with SB3's updates and rollouts that stay in torch.
+"""Subclasses of Stable-Baselines3's algorithms that keep SB3's updates, but store rollouts as torch tensors.
 
-Only public hooks of SB3 are used: buffers passed to the constructors, `collect_rollouts` and `train`.
+SB3 itself would copy each step to numpy. Only public hooks of SB3 are used: buffers passed to the constructors,
+`collect_rollouts` and `train`.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ class _Collecting:
 
 
 class _OnPolicy(_Collecting):
-    """On-policy collection. One call of the critic bootstraps all time-outs of a step."""
+    """Collection of rollouts for PPO and A2C; the critic is called once for all time-outs of a step."""
 
     rollout_buffer: TorchRolloutBuffer
     gamma: float
@@ -82,7 +83,10 @@ class FastA2C(_OnPolicy, A2C):  # type: ignore[misc]
 
 
 class _OffPolicy(_Collecting):
-    """Off-policy collection. The buffer holds actions in [-1, 1]; the environment gets them times the action bound."""
+    """Collection of transitions for SAC, TD3 and DDPG.
+
+    The buffer holds actions in [-1, 1]; the environment receives them multiplied by the action bound.
+    """
 
     replay_buffer: TorchReplayBuffer
     actor: Any

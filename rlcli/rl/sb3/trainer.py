@@ -39,7 +39,7 @@ _METRICS = {
     "train/critic_loss": "Loss/critic",
     "train/ent_coef": "Loss/entropy_coefficient",
 }
-"""SB3's name -> name of the metric."""
+"""Name of a metric in SB3's logger -> name of the metric in rlcli."""
 _MUST_BE_FINITE = ("Loss/surrogate", "Loss/value", "Loss/actor", "Loss/critic", "Policy/mean_std")
 _LR_RANGE = (1e-5, 1e-2)
 """Lowest and highest learning rate of the adaptive schedule."""
