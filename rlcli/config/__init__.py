@@ -1,1 +1,1 @@
-"""Configuration of a task: strict YAML reader, schema, and how files and command line are merged and checked."""
+"""Modules that read the configuration of a task: strict YAML reader, schema, merging of sources, and validation."""

@@ -1,4 +1,7 @@
-"""Place, `file:line`, of the Python code of a configuration or an agent of another framework."""
+"""Search for the Python code (`file:line`) that sets a value, for tasks and agents written for another framework.
+
+Error messages name this place.
+"""
 
 import inspect
 from collections.abc import Mapping
@@ -10,7 +13,7 @@ from rlcli.errors import ConfigError
 from rlcli.registry import is_framework
 
 _METHODS = ("__rlcli_task__", "__rlcli_agent__")
-"""Methods of the configurations and agents of other frameworks."""
+"""Names of methods by which objects of other frameworks' plugins (configurations, agents) are recognised."""
 
 
 def place_of(value: object) -> str:
@@ -42,5 +45,5 @@ def short_path(path: Path) -> Path:
 
 
 def at_place(error: ConfigError, place: str) -> ConfigError:
-    """Return an error whose problems without a file are at `place`."""
+    """Return the error with `place` added as the location of all its problems that have no location yet."""
     return ConfigError([replace(p, where=place) if p.where == "configuration" else p for p in error.problems])

@@ -1,4 +1,7 @@
-"""Output of a resolved configuration: YAML that reads back as the same configuration, origins, JSON Schema."""
+"""Conversion of a resolved configuration to text: YAML, which rlcli reads back unchanged, and JSON Schema.
+
+The YAML can have comments with the origin of each value. `rlcli show` prints these texts.
+"""
 
 import re
 from collections.abc import Sequence
@@ -23,9 +26,10 @@ _TAGS = {type(None): "null", bool: "bool", int: "int", float: "float", str: "str
 
 class _Dumper(yaml.SafeDumper):  # type: ignore[misc]  # PyYAML has no types
     def resolve(self, kind: type[yaml.Node], value: Any, implicit: tuple[bool, bool]) -> str:
-        """Return the tag that the strict reader gives to a plain scalar.
+        """Return the YAML type (tag) that rlcli's strict reader gives to a scalar without quotes.
 
-        PyYAML puts a string in quotes if this tag is not the tag of strings. So the strict reader reads a string again.
+        PyYAML puts a string in quotes if this type is not the string type. Without quotes, the strict reader would
+        read a text such as `1e3` as a number.
         """
         if kind is not yaml.ScalarNode or not implicit[0]:
             return str(super().resolve(kind, value, implicit))
@@ -252,7 +256,7 @@ def _explicit_origins(resolved: Resolved) -> list[tuple[Path, Origin]]:
 
 
 def _until_list(data: object, path: tuple[Any, ...]) -> tuple[tuple[Any, ...], Any]:
-    """Cut a path at the first list on it; return the cut path and the value at that path.
+    """Shorten a path so that it ends at the first list that it passes; return the short path and the list.
 
     An override can change one item of a list, but a `--config` file can only replace the whole list.
     """

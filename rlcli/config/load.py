@@ -209,7 +209,7 @@ def missing_models(resolved: Resolved) -> list[str]:
 
 
 def extensions(source: TaskSource) -> tuple[Vocabulary, type[BaseModel] | None]:
-    """Return what a task file may contain beyond the fixed keys: the terms, and the parameters of a direct task.
+    """Return the parts of a task file that depend on the task: its terms, and the parameters of a direct task.
 
     Returns:
         The terms that the file may name (those of `rlcli.mdp` and the task's own), and the pydantic model of `params`;

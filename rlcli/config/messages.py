@@ -1,4 +1,7 @@
-"""Conversion of pydantic's validation errors to messages: the key, the value found, what is allowed, a similar key."""
+"""Conversion of pydantic's validation errors to messages for users.
+
+A message names the wrong key, the value found and the allowed values; a hint may name a similar key.
+"""
 
 import functools
 import json
@@ -94,9 +97,9 @@ def key_locations(models: Mapping[str, type[BaseModel]]) -> dict[str, list[str]]
 def _message(
     path: Path, items: list[Any], model: type[BaseModel], data: object, locations: KeyLocations, top: bool
 ) -> tuple[str, str | None, Path]:
-    """Return the message, the hint and the path to report for `items`, pydantic's errors at one path of the data.
+    """Return the message, the hint and the path for `items`, all errors of pydantic at one path of the data.
 
-    `top`: `model` is the model of a whole file.
+    `top` is True if `model` describes a whole file.
     """
     kind, found = items[0]["type"], items[0]["input"]
     if kind == "extra_forbidden":
@@ -139,7 +142,9 @@ _KEYS_OF_OTHER_FRAMEWORKS = {
     "params": ("func", "write the parameters of a term beside its 'func'"),
     "device": ("dt", "the device is an option: --device cpu"),
 }
-"""Key that users of other frameworks write -> (a key that the mapping has in this case, what to write instead)."""
+"""Key that users of other frameworks write -> hint about what to write instead, and when this hint applies.
+
+The hint applies if the mapping may have a certain other key; a value is (this other key, hint)."""
 
 
 def _suggest_key(key: str, fields: Iterable[str], locations: KeyLocations) -> str:
@@ -168,7 +173,7 @@ def _inside(location: str) -> str:
 
 
 def _expected(item: Any) -> str:
-    """Return in words what the value of one of pydantic's errors must be, such as `a number > 0` or `true or false`."""
+    """Return the allowed values of the key with an error, in words, such as `a number > 0` or `true or false`."""
     kind, context = item["type"], item.get("ctx", {})
     if kind in _BOUNDS:
         sign, key = _BOUNDS[kind]
@@ -194,7 +199,7 @@ def _choices(item: Any) -> list[str]:
 
 
 def _unquoted(text: str, items: Iterable[Any]) -> str | None:
-    """Return the hint to remove the quotes if `text` is a number or truth value in quotes; None for other text."""
+    """Return a hint to remove the quotes if `text` is a number or true/false in quotes; None for other texts."""
     try:
         value = strict_yaml.load_value(text)
     except strict_yaml.YamlError:

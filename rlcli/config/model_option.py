@@ -1,4 +1,7 @@
-"""The option `--model`: the user's MJCF files for tasks of other frameworks, whose files name no MJCF."""
+"""Reader of the option `--model`, with which users give MJCF files for tasks of other frameworks.
+
+The files of such tasks name robots as USD or URDF assets, which rlcli cannot simulate, and no MJCF.
+"""
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path as FilePath
@@ -46,7 +49,7 @@ def read_models(words: Iterable[str]) -> dict[str, Any]:
 
 
 def given_settings(recorded: Mapping[str, Any], changes: Mapping[Path, Any]) -> tuple[dict[str, Any], dict[Path, Any]]:
-    """Return the settings that are passed to a task in Python, whose file may leave models and values open.
+    """Return the settings that the user must supply for a task in Python whose file has no value for them.
 
     Args:
         recorded: the configuration that a run has stored; empty without a run.

@@ -1,4 +1,7 @@
-"""Conversion of `success` in runs of earlier versions, where it was one function, to named conditions."""
+"""Conversion of the key `success` in runs of earlier versions of rlcli to the present form.
+
+Earlier it was one function, `{func: ...}`; now it is a mapping of named conditions, `{NAME: {func: ...}}`.
+"""
 
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,7 @@
-"""Task files in another framework's format: their own top-level keys, and the merging of translated files.
+"""Support for task files in another framework's format: their additional top-level keys, and translated files.
 
-Only the environment class of the format reads such a key, for example `oige`. In the file it is at the top level; in a
-`TaskConfig` it is below the key `foreign`.
+Such a file may have a key that only the environment class of the format reads, named after the format. In the file the
+key is at the top level; in a `TaskConfig` it is below the key `foreign`.
 """
 
 from collections.abc import Callable, Mapping

@@ -1,4 +1,4 @@
-"""Conversion of a configuration in Python to the plain data that a YAML file would contain.
+"""Conversion of a task's configuration in Python to the plain data that a YAML file would contain.
 
 The configuration is a `TaskConfig`, a mapping with its keys, or a function that returns one. Or it is a configuration
 of another framework with a method `__rlcli_task__(root, models) -> PythonTask`; its optional method
@@ -55,7 +55,7 @@ class PythonTask:
     places: dict[Path, str] = field(default_factory=dict)
     """Path in `data` -> file and line of the class or file that sets its value; `()`: of the configuration's class."""
     filled: list[Path] = field(default_factory=list)
-    """Paths of required settings that have no value in the file and got one from the command line."""
+    """Paths of required settings without a value in the file, whose value comes from the command line."""
 
 
 def source_of(value: object, root: FilePath | None = None, name: str = "task") -> TaskSource:
@@ -442,6 +442,6 @@ def _report_choice(message: str) -> None:
 
 
 def _hint(error: BaseException) -> str | None:
-    """Return what an installed plugin for another framework's tasks advises about an error; None without advice."""
+    """Return the hint that the plugin of another framework's format has for an error; None if there is none."""
     hint: str | None = first_result("hint", error)
     return hint

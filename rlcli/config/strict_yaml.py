@@ -100,7 +100,7 @@ def decode(text: str | bytes) -> str:
 
 
 def _after(before: str) -> Mark:
-    """Return the position (line, column) of the character that follows the text `before`."""
+    """Return the position (line, column) of the first character after the text `before` in a file."""
     return before.count("\n") + 1, len(before) - before.rfind("\n")
 
 
@@ -127,7 +127,7 @@ def _parse_cached(text: str) -> tuple[Any, dict[Path, Mark]]:
 
 @contextlib.contextmanager
 def syntax_errors(text: str) -> Iterator[None]:
-    """Turn PyYAML's errors about a text, in the block, into YamlErrors with their position."""
+    """Convert PyYAML's errors that occur in the `with` block to `YamlError`s with line and column."""
     try:
         yield
     except yaml.MarkedYAMLError as error:
@@ -140,7 +140,7 @@ def syntax_errors(text: str) -> Iterator[None]:
 
 
 class Loader(yaml.SafeLoader):  # type: ignore[misc]
-    """PyYAML's safe loader. An escape that is no character is an error with its position."""
+    """PyYAML's safe loader; it reports an invalid escape sequence in a string as an error with its position."""
 
     def fetch_more_tokens(self) -> Any:
         """Read the next tokens of the text."""

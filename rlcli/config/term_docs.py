@@ -33,7 +33,7 @@ _SECTION_KEYS: dict[str, dict[str, Any]] = {
     "events": {"mode": "reset"},
     "commands": {"resampling_time_s": [4.0, 8.0]},
 }
-"""Required keys of every term of a section, with the values of the examples."""
+"""Section of a task file -> the required keys that all its terms share, with the values that examples show."""
 _BOUNDS = (("minimum", ">="), ("exclusiveMinimum", ">"), ("maximum", "<="), ("exclusiveMaximum", "<"))
 
 

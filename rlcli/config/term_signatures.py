@@ -90,7 +90,7 @@ class Signature:
     """First line of the docstring."""
     parameters: tuple[Parameter, ...]
     error: str | None = None
-    """Why the function cannot be a term; None: it can."""
+    """Reason why the function cannot be used as a term; None if it can be used."""
     target: Any = None
     """The function or class itself, if it comes from a configuration in Python; None: `attribute` of the file."""
     description: str = ""
@@ -188,7 +188,9 @@ def signature_of(term: Any, name: str) -> Signature:
 
 
 def read_params(file: Path, class_name: str) -> type[schema.StrictModel] | None:
-    """Return a model like the class `Params` of a direct task, rebuilt from the source code; None without `Params`.
+    """Return a pydantic model with the fields of a direct task's class `Params`; None if the task has no `Params`.
+
+    The model is made from the source code, which is not imported.
 
     `Params` is inside of the task's class or of one of its base classes.
 
@@ -286,9 +288,9 @@ def _model(name: str, base: type[schema.StrictModel], fields: dict[str, Any]) ->
 
 @functools.cache
 def _closed(section: str) -> type[schema.TermConfig]:
-    """Return a subclass of a section's model (of the keys that all its terms share) that refuses unknown keys.
+    """Return a pydantic model with the keys that all terms of a section share; it refuses unknown keys.
 
-    The models of single terms add the parameters of their functions to this class.
+    The models of single terms are subclasses, which add the parameters of the terms' functions.
     """
     base = SECTIONS[section]
     config = ConfigDict(extra="forbid", protected_namespaces=())  # a parameter may start with `model_`

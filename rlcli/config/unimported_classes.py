@@ -1,4 +1,7 @@
-"""Search for classes and their base classes in source files, by their syntax trees, without importing the files."""
+"""Search for classes and their base classes in Python source files, without importing (executing) the files.
+
+The configuration is checked in this way before a task's code is trusted.
+"""
 
 from __future__ import annotations
 

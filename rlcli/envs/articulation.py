@@ -79,11 +79,17 @@ class ArticulationView:
         return self._entity.joint_names.index(name)
 
     def get_joint_positions(self, indices: Tensor | None = None, clone: bool = True) -> Tensor:
-        """Return joint positions. (n, num_dof) [m or rad]; without `clone` and `indices` a view: only read it."""
+        """Return joint positions. (n, num_dof) [m or rad]
+
+        Without `clone` and `indices` the tensor is a view of the simulation's state: do not write to it.
+        """
         return _rows(self._entity.data.joint_pos, indices, clone)
 
     def get_joint_velocities(self, indices: Tensor | None = None, clone: bool = True) -> Tensor:
-        """Return joint velocities. (n, num_dof) [m/s or rad/s]; without `clone` and `indices` a view: only read it."""
+        """Return joint velocities. (n, num_dof) [m/s or rad/s]
+
+        Without `clone` and `indices` the tensor is a view of the simulation's state: do not write to it.
+        """
         return _rows(self._entity.data.joint_vel, indices, clone)
 
     def get_dof_limits(self) -> Tensor:
@@ -162,7 +168,7 @@ class ArticulationView:
             return
         rows = slice(None) if indices is None else indices.long()
         if not isinstance(columns, slice) and isinstance(rows, Tensor):
-            rows = rows[:, None]  # so that rows and columns span a grid
+            rows = rows[:, None]  # indices (n, 1) and (k,) select n x k values
         field[rows, columns] = values.to(field.dtype)
 
 

@@ -24,7 +24,7 @@ from rlcli.sim.rotations import rotate_inverse
 from rlcli.sim.state_cache import SimData
 
 __all__ = ["grid"]
-"""Public names of this module; the others are for `VecEnv` alone."""
+"""Names of this module for use by plugins and other code; the other names are used by `VecEnv` alone."""
 
 
 @dataclass(frozen=True, slots=True)

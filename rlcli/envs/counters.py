@@ -18,7 +18,7 @@ from rlcli.sim.env_selection import Field, Selection, in_place
 from rlcli.sim.saved_tensors import TensorState
 
 _MIN_STATES = 5
-"""Smallest number of states whose mean reward is compared with that of others."""
+"""Number of environments, with success and without, that `reward_gap` needs at least to compare their rewards."""
 
 
 class SuccessCondition:

@@ -384,7 +384,7 @@ class DirectEnv(VecEnv):
         return {"policy": obs, "critic": states} if self.task.num_states else {"policy": obs}
 
     def _reset_stale(self, env_ids: Tensor) -> None:
-        """Reset environments when the task itself calls `reset_idx`, whose place this method takes.
+        """Reset environments when the task's own code calls `reset_idx`: this method replaces `reset_idx`.
 
         Tasks of OmniIsaacGymEnvs call `reset_idx` at the start of `pre_physics_step` where `reset_buf` is set. If the
         environment loop has just reset an environment, only its `reset_buf` is cleared; all others are reset.

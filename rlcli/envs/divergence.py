@@ -1,4 +1,4 @@
-"""Handling of diverged simulations, and of numbers that are not finite, in the environment loop.
+"""Detection of diverged simulations and of numbers that are not finite in the environment loop, and the recovery.
 
 A diverged environment returns to its last finite state, and its episode ends there as terminated. An environment that
 an event or a reset has put out of bounds is quarantined: it returns to a good state at once, and its episode ends with

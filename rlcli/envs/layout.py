@@ -1,4 +1,7 @@
-"""Meaning of each column of an observation and of an action: the contract between a policy and its environment."""
+"""Description of each column of observations and actions (term, scale, limits), which a checkpoint stores.
+
+A policy fits an environment only if both have the same layout.
+"""
 
 from __future__ import annotations
 

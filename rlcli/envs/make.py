@@ -1,4 +1,4 @@
-"""`make_env`, which builds the environment of a task."""
+"""Function `make_env`, which builds the environment of a task in this process."""
 
 from __future__ import annotations
 

@@ -230,7 +230,10 @@ class ManagedEnv(VecEnv):
         return selection
 
     def _select_by_step(self, mask: Field) -> Selection | None:
-        """Return a selection of environments by a mask; its random numbers depend on the current step."""
+        """Return the environments where `mask`, (num_envs,), is true; None if there are none.
+
+        The random numbers of this selection depend on the current step, so each step draws new ones.
+        """
         counters = self._counters.common_step.expand(self.num_envs)
         return self.engine.select(mask, self.seed, counters.contiguous() if self.engine.asynchronous else counters)
 

@@ -28,7 +28,7 @@ from rlcli.scene.sensors import RaySensor
 from rlcli.sim.rotations import from_euler
 
 _PAIRS, _STEPS = 64, 4
-"""Number of random states, and of steps from each of them."""
+"""Number of random start states of the symmetry test, and number of steps from each start state."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -278,7 +278,10 @@ def _relative(difference: Tensor, values: Tensor) -> Tensor:
 
 
 def _ray_partners(pipeline: Pipeline) -> list[int] | None:
-    """Return the index of each ray's mirror image, if the term has one column for each ray of its sensor; else None."""
+    """Return, for each ray of the term's ray sensor, the index of the ray that is its mirror image.
+
+    Return None if the columns of the term are not the rays of a sensor.
+    """
     call = pipeline.term.instance
     parameters = getattr(call, "keywords", None) or vars(call)
     for sensor in parameters.values():

@@ -1,4 +1,4 @@
-"""Shards: parts of the environments of a task, each of which one process steps."""
+"""Division of a task's environments into shards: consecutive environments that one process steps."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Results of a step of an environment."""
+"""Data classes for the results of an environment step: observations, rewards, ended episodes."""
 
 from __future__ import annotations
 

@@ -71,7 +71,7 @@ class VecEnv(Workflow):
         self.seconds = {"physics": 0.0, "step": 0.0}
         self.observers = Observers()
         self.physics_override: Callable[[], None] | None = None
-        """Function that steps the simulations instead of the engine and writes their states and derived fields."""
+        """Function that replaces the engine's physics step: it writes states and derived fields; None: none."""
         self._last_obs: dict[str, Tensor] = {}
         self._read_finals: Field = torch.zeros(self.num_envs, dtype=torch.bool)  # where `final_obs` is valid
         self._counters = EpisodeCounters(self.shard, self.device)
@@ -107,7 +107,9 @@ class VecEnv(Workflow):
         self.origins = built.origins
         """Start position of each environment in its world: zeros without a terrain. (num_envs, 3) [m]"""
         self.env_origins = grid(distinct, self.config.scene.env_spacing).to(self.device)[streams]
-        """Position of each environment on a grid, for task formats in which all share a world. (num_envs, 3) [m]"""
+        """Position of each environment on a grid. (num_envs, 3) [m]
+
+        Task formats of other frameworks need it, in which all environments are in one world, side by side."""
         self._counters.attach(self.engine)
         self._bind_terms()
         success = self._binder.bind_all("success")

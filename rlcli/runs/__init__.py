@@ -1,1 +1,1 @@
-"""The folder of a run (one training): its checkpoints, configuration and metrics, and comparisons of runs."""
+"""Modules that write, read and compare the folders of runs; a run is one training, with checkpoints and metrics."""

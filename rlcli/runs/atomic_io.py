@@ -32,7 +32,7 @@ def write_atomic(file: Path, content: bytes | str) -> Path:
     temporary = file.with_name(f".{file.name}.tmp-{os.getpid()}")
     try:
         with disk_errors(file):
-            temporary.unlink(missing_ok=True)  # open() would follow a link of this name
+            temporary.unlink(missing_ok=True)  # open() would follow a link with this name
             write_synced(temporary, data)
             require_lock(file)
             os.replace(temporary, file)
@@ -192,4 +192,4 @@ _HINTS = {
     30: "the disk is read-only: make it writable, copy the run, or choose another folder with --runs-dir",
     122: "the disk quota is used up: free some space",
 }
-"""errno -> hint: ENOENT, EFBIG, ENOSPC, ENAMETOOLONG, EACCES, EROFS, EDQUOT."""
+"""Error number of the operating system (errno), such as ENOSPC for a full disk -> hint for the user."""

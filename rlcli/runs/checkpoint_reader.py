@@ -77,7 +77,7 @@ class Shard(FileModel):
 
 
 class _Log(FileModel):
-    """Entry of manifest.json for a log, such as a replay buffer: its rows `first` to `stop` - 1, and their files."""
+    """Entry of manifest.json for a log, such as a replay buffer: rows `first` to `stop` - 1, in several files."""
 
     first: Count
     stop: Count
@@ -115,7 +115,7 @@ class _TensorEntry(FileModel):
 
 
 class _Header(RootModel[Annotated[dict[str, _TensorEntry], Field(max_length=20_000)]]):
-    """The header of a safetensors file."""
+    """Header of a safetensors file: the shape of each tensor, by name."""
 
 
 class _State(FileModel):
@@ -189,7 +189,7 @@ class Checkpoint:
         """
         try:
             blank = blank_policy(self.json("policy.json"))
-            # the file holds the tensors of policy.json and a header; a longer one is refused before it is read
+            # the size follows from policy.json; a larger file is refused before it is read
             return filled(blank, self.tensors("policy", size_of(blank) + _HEADER_LIMIT))
         except CheckpointError as error:
             if str(self.folder) in error.message:
@@ -243,7 +243,7 @@ class Checkpoint:
                 rows.read(start, min(start + _ROWS_AT_ONCE, rows.stop))
 
     def shards(self) -> dict[str, list[Shard]]:
-        """Return the files of each log (such as a replay buffer), those with the oldest rows first.
+        """Return the files of each log (data in rows, such as a replay buffer), the file with the oldest rows first.
 
         Raises:
             CheckpointError: if the manifest's entry `logs` is malformed.

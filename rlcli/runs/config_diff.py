@@ -34,7 +34,7 @@ _COSMETIC_KEYS = frozenset(
     ]
 )
 _NOT_PHYSICS = frozenset(("init", "soft_joint_pos_limit_factor"))
-"""Keys of an entity that set the start of episodes, or a limit that only terms read."""
+"""Keys of an entity that do not change the physics: they set the start of episodes, or a limit that only terms read."""
 _EMPTY: tuple[Any, ...] = (None, {})
 """Values that count as equal to a missing key."""
 

@@ -42,7 +42,7 @@ Name = Annotated[str, Field(max_length=500)]
 
 
 class _EvaluationRecord(FileModel):
-    """Entries of a saved evaluation that rlcli reads; the file may have more."""
+    """The entries of a stored evaluation that rlcli reads; the file may have further entries."""
 
     command: Literal["eval"]
     episodes: Annotated[int, Field(ge=1)]

@@ -25,7 +25,7 @@ OPS = {
     "rotate": 2, "unrotate": 2, "product": 2, "inverse": 1, "unique": 1, "asin": 1, "angle": 1, "wrap": 1, "below": 4,
     "filter": 1,
 }  # fmt: skip
-"""Operation of formulas -> number of its operands; None: any number."""
+"""Operation that a formula may contain, such as `add` -> number of its operands; None: any number."""
 FIELDS = {
     "qpos", "qvel", "xpos", "xipos", "xquat", "site_xpos", "cvel", "subtree_com", "sensordata", "qfrc_actuator",
     "mocap_pos", "mocap_quat",

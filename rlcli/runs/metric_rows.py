@@ -14,7 +14,7 @@ LONGEST_LINE = 2**20
 """Longest line of `metrics.jsonl`, which has the metrics of one iteration [bytes]."""
 _MOST_BYTES = 2**30
 _LARGEST = 1e300
-"""Larger numbers are ignored: an integer with many digits cannot become a float."""
+"""Largest absolute value of a metric; larger numbers are ignored, because such an integer cannot become a float."""
 
 
 def read_rows(run: Run, *, strict: bool = False) -> Iterator[dict[str, Any]]:

@@ -27,11 +27,13 @@ _MAX_ROWS = 20
 """Number of newest rows of metrics, or of evaluations, that are read."""
 _MAX_ROW_BYTES = 1024**2
 _MAX_SEARCH_BYTES = 64 * 1024**2
-"""Bytes of the metrics that are searched for one row."""
+"""Number of bytes at the end of `metrics.jsonl` that are searched for the row of one step."""
 _MAX_FILES = 20_000
 _STARTING_S = 5.0
-"""Age up to which a folder without run.json may belong to a run that is being created [s]. A time stamp this far in the
-future comes from another clock."""
+"""Age up to which a folder without run.json may belong to a run that is being created [s].
+
+A folder whose time stamp is further in the future than this was dated by the clock of another machine.
+"""
 
 
 @dataclass(slots=True)
@@ -50,11 +52,11 @@ class Overview:
     """Number of iterations of the whole training."""
     step: int | None = None
     last: dict[str, float] = field(default_factory=dict)
-    """`return` and `success` of the newest iteration in which episodes ended."""
+    """Values `return` and `success` of the newest iteration in which episodes ended."""
     best: dict[str, float] = field(default_factory=dict)
-    """`step`, `return` and `success` of the best evaluation during training."""
+    """Values `step`, `return` and `success` of the best evaluation during training."""
     evaluation: dict[str, Any] = field(default_factory=dict)
-    """`step`, `episodes`, `return` and `success` of the newest checkpoint that `rlcli eval` has evaluated."""
+    """Values `step`, `episodes`, `return` and `success` of the newest checkpoint that `rlcli eval` has evaluated."""
     started: str | None = None
     age_s: float | None = None
     """Time since the start [s]."""

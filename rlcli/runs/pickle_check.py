@@ -11,7 +11,7 @@ MAX_BYTES = 4 * 2**20
 """Largest pickle [bytes]; also the largest number of values in it, each counted as often as it is referred to."""
 _MAX_DEPTH = 100
 _MAX_KEY = 2**31
-"""Whole numbers of this size or larger are no keys: many of them can have the same hash."""
+"""Integers from this size on are refused as dictionary keys: a file could have many keys with the same hash."""
 _FUNCTIONS = {"torch._utils _rebuild_tensor_v2", "torch._utils _rebuild_parameter"}
 _ORDERED_DICT = "collections OrderedDict"
 _DTYPES = ("Float", "Double", "Half", "BFloat16", "Long", "Int", "Short", "Byte", "Bool")
@@ -27,7 +27,7 @@ SAVE_HINT = (
 
 @dataclass(slots=True, eq=False)
 class _Value:
-    """Value that a pickle would create, reduced to what decides whether later operations on it are safe."""
+    """Value that a pickle would create; stores only the properties that decide whether later operations are safe."""
 
     kind: str = "other"
     """`tuple`, `list`, `dict`, `other`, or the global name."""
@@ -35,7 +35,7 @@ class _Value:
     depth: int = 0
     size: int = 1
     stored: bool = False
-    """Whether another value contains it. It may not grow then, so `depth` and `size` of the other value stay right."""
+    """Whether another value contains this one. Then it must not grow: `depth` and `size` of the other would change."""
 
 
 @dataclass(slots=True)
@@ -44,7 +44,7 @@ class _Simulation:
 
     stack: list[_Value] = field(default_factory=list)
     below: list[list[_Value]] = field(default_factory=list)
-    """The stacks below each mark."""
+    """Stacks that were set aside when a MARK operation started a new one; the newest is last."""
     memo: dict[int, _Value] = field(default_factory=dict)
 
     def apply(self, opcode: str, argument: Any) -> None:
@@ -151,7 +151,7 @@ def _result(function: str, arguments: _Value) -> _Value:
 
 
 class _RefusedError(Exception):
-    """Refusal of a pickle; the message continues the file's name."""
+    """Error for a pickle that is refused. The message is the rest of a sentence that starts with the file's name."""
 
 
 def require_tensors_only(description: bytes, where: str) -> None:

@@ -27,7 +27,7 @@ BUNDLE = 1
 
 
 class _BundleRecord(FileModel):
-    """The entries of manifest.json that a bundle has and a checkpoint of a run does not have."""
+    """Entries that only the manifest.json of a bundle has, and not that of a run's checkpoint."""
 
     task: TaskRecord
     agent: Annotated[PrintableText, Field(max_length=200)] | None = None
@@ -93,7 +93,7 @@ def write_bundle(
         CheckpointError: if the checkpoint is corrupt, or its manifest has no layout of the policy's columns.
         UsageError: if the folder holds anything but a bundle.
         MachineError: if the disk reports an error; an older bundle is unchanged.
-        VerdictError: if the written files give another policy; they are deleted.
+        VerdictError: if the policy read back from the files differs from the checkpoint's; the files are deleted.
     """
     check_bundle_target(output)
     policy = checkpoint.policy()

@@ -18,7 +18,7 @@ from rlcli.runs.run import Run
 from rlcli.runs.run_ref import find_checkpoint, list_runs
 
 SHIPPED = "shipped"
-"""Reference to the policy that a task ships."""
+"""Word that refers to the policy which comes with a task, as in `--checkpoint shipped`."""
 
 
 @dataclass(frozen=True, slots=True)

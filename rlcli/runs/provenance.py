@@ -1,4 +1,4 @@
-"""Record of what may change the results of a run besides its configuration: versions, source code, hardware.
+"""Record of a run's software and hardware: versions, source code, processor; they may change its results.
 
 The record is stored in run.json, so that a later run can be compared with this one.
 """

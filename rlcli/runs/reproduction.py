@@ -1,4 +1,4 @@
-"""Parts of `rlcli reproduce`, which trains a run again: checks before the training, and the new run's folder."""
+"""Functions of `rlcli reproduce`, which trains a run again: checks before the training, and the new run's folder."""
 
 from collections.abc import Mapping
 from pathlib import Path

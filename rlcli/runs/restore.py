@@ -1,4 +1,7 @@
-"""Task and configuration of a saved run, and checks that a checkpoint fits an environment, as play and resume need."""
+"""Functions that find the task and configuration of a saved run, and check that a checkpoint fits an environment.
+
+Commands that use a trained policy call them, such as `play`, `eval` and `train --resume`.
+"""
 
 import os
 import shlex
@@ -165,7 +168,7 @@ def require_same_policy(checkpoint: Checkpoint, policy: Policy, trainer: str) ->
 
 
 _MAX_CELL = 200
-"""Longest text in a column of a table of differences [characters]."""
+"""Largest width of a column in a table of differences [characters]; longer texts are cut."""
 
 
 def _table(rows: Sequence[tuple[str, str, str]]) -> list[str]:
@@ -207,7 +210,9 @@ _CONTRACT = ("name", "size", "elements", "scale", "offset", "clip", "history", "
 
 
 def _differ(was: Mapping[str, Any] | None, now: Mapping[str, Any] | None) -> bool:
-    """Return whether a term of a checkpoint, `was`, differs from the environment's, `now`, in a key of both.
+    """Return whether the layout of a term in a checkpoint, `was`, differs from that in the environment, `now`.
+
+    Only keys that both layouts have are compared.
 
     Checkpoints of older versions lack some keys.
     """

@@ -1,4 +1,4 @@
-"""The folder of a run: its configuration, its record and its checkpoints."""
+"""Class `Run`, the folder of one training with configuration, record (run.json) and checkpoints; it can be locked."""
 
 import contextlib
 import errno
@@ -41,7 +41,7 @@ STUDY = "study.json"
 WAITING = "waiting"
 """State of a run of a study that has not started yet."""
 MAX_NAME = 200
-"""Longest `--name`; with the time of a run in front it is a part of a path, which has at most 255 bytes."""
+"""Largest length of `--name` [characters]; with the time in front it is a folder's name, of at most 255 bytes."""
 _TASK = re.compile(r"(?!\.{1,2}$)[^/\\:]{1,255}")
 _MAX_FILES = 100_000
 _NAME = re.compile(r"[A-Za-z0-9][\w.-]*", re.ASCII)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rlcli.runs.checkpoint_reader import Checkpoint
 
 SECTIONS = ("configuration", "environment", "metrics", "weights", "policy")
-"""Parts of the comparison, causes before their effects: a difference may explain differences in later parts."""
+"""Parts of two runs that are compared, in this order: a difference in one part may cause those in later parts."""
 _CLOCK = "Perf/"
 """Prefix of metrics that measure time, which are never equal."""
 _ROWS = 4096
@@ -202,10 +202,10 @@ def _first_unequal(left: Mapping[Any, Any], right: Mapping[Any, Any], keys: Iter
 
 
 def _presence(word: str, left: bool, right: bool) -> tuple[str | None, str | None]:
-    """Return the left and the right value of a `Difference` of an entry that one side does not have.
+    """Return the left and the right value of a `Difference` for an entry that only one side has.
 
     Args:
-        word: the value of a side that has the entry; that of the other side is None.
+        word: the value for a side that has the entry; the value for a side without the entry is None.
         left: whether the left side has the entry.
         right: whether the right side has the entry.
     """

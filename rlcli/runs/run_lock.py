@@ -69,7 +69,7 @@ class RunLock:
 
 
 _held: WeakValueDictionary[Path, RunLock] = WeakValueDictionary()
-"""Folder -> lock that this process holds."""
+"""Locks that this process holds, by folder."""
 
 
 def require_locks(path: Path) -> None:
@@ -103,7 +103,7 @@ def _identity(file: Path) -> tuple[int, int]:
 
 
 def _can_share(handle: int) -> bool:
-    """Return whether no process holds the lock: a shared lock of the open lock file is tried.
+    """Return whether no process holds the lock, by an attempt to take a shared lock of the open lock file.
 
     The shared lock ends when the handle is closed.
     """

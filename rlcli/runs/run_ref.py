@@ -1,4 +1,4 @@
-"""References to runs and checkpoints on a command line: folder, name, `latest`, `RUN@best` or `RUN@step:N`."""
+"""Search for the run or checkpoint that a command line names: a folder, a name, `latest`, RUN@best or RUN@step:N."""
 
 import glob
 import logging

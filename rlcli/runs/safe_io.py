@@ -91,7 +91,7 @@ def read_errors(file: Path) -> Iterator[None]:
 
 
 def read_file(file: Path, limit: int, *, size: int | None = None, missing: str | None = None) -> bytes:
-    """Read the content of a plain file, only once: later checks must use these bytes, since the file may change.
+    """Return the content of a regular file. Check these bytes, and do not read the file again: it may change.
 
     Args:
         file: the file.
@@ -148,7 +148,7 @@ def _opened(file: Path) -> Iterator[tuple[BinaryIO, int]]:
     try:
         if file.is_symlink():
             raise CheckpointError(f"{file} is a link; replace it by the file itself")
-        handle = os.open(file, os.O_RDONLY | _NO_LINKS)  # O_NONBLOCK: opening a pipe must not block
+        handle = os.open(file, os.O_RDONLY | _NO_LINKS)  # O_NONBLOCK: open() must not wait for the writer of a pipe
         status = os.fstat(handle)
         if not stat.S_ISREG(status.st_mode):
             os.close(handle)

@@ -1,4 +1,4 @@
-"""Tensors as bytes in the format of safetensors."""
+"""Conversion of tensors to the bytes of a safetensors file, with a check that there is enough memory."""
 
 from collections.abc import Mapping
 
@@ -7,7 +7,7 @@ import safetensors.torch
 from torch import Tensor
 
 _COPIES = 3
-"""Copies of all tensors that safetensors holds at a time: of each tensor, of the file, and the bytes for Python."""
+"""Number of copies of all tensors that the library safetensors has in memory at a time while it writes bytes."""
 
 
 def tensor_bytes(tensors: Mapping[str, Tensor], metadata: dict[str, str] | None = None) -> bytes:

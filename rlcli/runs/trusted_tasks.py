@@ -60,7 +60,7 @@ def _key(record: Mapping[str, Any]) -> str:
 
 def _record_use(key: str) -> None:
     file = _file(key)
-    with contextlib.suppress(OSError, MachineError):  # without the file the user has to name the task again
+    with contextlib.suppress(OSError, MachineError):  # without the file, the user has to name the task again
         if not file.exists():
             file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
             write_atomic(file, key)

@@ -1,1 +1,1 @@
-"""Scene of a task: the MuJoCo model of its robots and objects, with actuators, sensors and terrain, and their state."""
+"""Modules that build a task's scene (a MuJoCo model of robots, objects, sensors and terrain) and read its state."""

@@ -20,9 +20,9 @@ from rlcli.sim.env_selection import Selection
 from rlcli.sim.saved_tensors import TensorState, require_in_range
 
 POSITION, VELOCITY, EFFORT = range(3)
-"""Rows of `ActuatorModel.targets`."""
+"""Indices of the position, velocity and effort targets in the second dimension of `ActuatorModel.targets`."""
 Controller = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
-"""Function (targets, joint positions, joint velocities) -> (efforts before limits, efforts after limits).
+"""Controller: a function (targets, joint positions, joint velocities) -> (efforts before limits, efforts after limits).
 
 Targets are (num_envs, 3, k), all others (num_envs, k).
 """
@@ -46,7 +46,7 @@ class ActuatorModel(TensorState):
         self.joints = match(config.joints, entity.joint_names, "joint")
         """Joint columns, in the order of the configuration."""
         self.columns = as_index(self.joints, device)
-        """`joints` as an index into the entity's joints."""
+        """Index that selects the driven joints in tensors with one column for each joint of the entity."""
         names = [entity.joint_names[j] for j in self.joints]
         motors = dict(entity.actuators_of("motor"))
         controls = [motors[j] for j in self.joints]
@@ -76,7 +76,7 @@ class ActuatorModel(TensorState):
         default = entity.data.default_joint_pos[:, self.joints]
         self._default_targets = torch.stack([default, torch.zeros_like(default), torch.zeros_like(default)], dim=1)
         self._stream = stream(f"scene.entities.{entity.name}.actuators.{name}")
-        low, high = config.delay  # in physics steps
+        low, high = config.delay  # numbers of physics steps
         self._min_delay, self._num_delays = low, high - low + 1
         self._target_history = torch.zeros(n, high + 1, 3, k, device=device) if high else None
         """Targets of the last physics steps, the newest last. (num_envs, longest delay + 1, 3, k)"""

@@ -31,7 +31,7 @@ _DISABLED_EFFECTS = ("mjRND_SHADOW", "mjRND_REFLECTION", "mjRND_HAZE", "mjRND_FO
 _VISIBLE_CATEGORIES = int(mujoco.mjtCatBit.mjCAT_STATIC | mujoco.mjtCatBit.mjCAT_DYNAMIC)
 _INTEGRATION_STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 _MAX_GEOMS = 10_000
-"""Largest number of geoms in an image."""
+"""Largest number of geoms that an image can show."""
 _JOIN_TIMEOUT = 5.0
 """Longest time to wait for a thread to end [s]."""
 
@@ -54,7 +54,7 @@ class CameraSensor(LazySensor):
         shape = (config.height, config.width, _CHANNELS[config.data])
         kind = torch.uint8 if config.data == "rgb" else torch.float32
         self.names = [name]
-        """The sensor's name, as a list of one: other sensors have a name for each body or ray."""
+        """List with the sensor's name as its only item; other sensors have one name for each body or ray."""
         self._image = torch.zeros(engine.num_envs, *shape, dtype=kind)
         self._pixels = self._image.numpy()
 
@@ -225,7 +225,7 @@ class RendererPool:
         return len(self._threads)
 
     def run(self, work: Sequence[Callable[[CameraRenderer], None]]) -> None:
-        """Call each function in another thread, with the thread's renderer, and wait for all of them.
+        """Call each function in a thread of its own, with this thread's renderer as argument; wait for all of them.
 
         Raises:
             MachineError: after `close`, or in a fork of the process that opened the contexts.
@@ -306,7 +306,7 @@ def _end_threads(orders: list[_Orders], threads: list[threading.Thread], process
 
 
 def _set_clip_planes(view: mujoco.MjvGLCamera, near: float, far: float) -> None:
-    """Set the distances of a camera's near and far clipping planes [m] without changing its field of view."""
+    """Set the near and far clipping distances of a camera [m]; its field of view stays the same."""
     if not view.orthographic:
         for name in ("center", "width", "bottom", "top"):  # MuJoCo measures them on the near plane
             value = getattr(view, f"frustum_{name}") * near / view.frustum_near

@@ -1,4 +1,7 @@
-"""Efforts of the actuators on an entity's joints, with and without their limits."""
+"""Computation of the efforts that actuators would have on an entity's joints without limits.
+
+Terms that penalise saturated actuators use them.
+"""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ KINDS = {
     "Tendons": (mujoco.mjtObj.mjOBJ_TENDON, "ntendon"),
     "Pairs": (mujoco.mjtObj.mjOBJ_PAIR, "npair"),
 }
-"""Kind of element -> MuJoCo's type, and the field of the model that counts them."""
+"""Kind of element, such as Joints -> (its type in MuJoCo, name of the MjModel field with the number of them)."""
 _SCALAR = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 
 
@@ -100,7 +100,7 @@ class Entity:
         return self._index(positions), [names[p] for p in positions]
 
     def actuators_of(self, kind: str) -> list[tuple[int, int]]:
-        """Return (index of the joint in the entity, id of the actuator in the model) of MuJoCo actuators of a kind.
+        """Return, for MuJoCo's actuators of one kind, (index of the driven joint in the entity, id of the actuator).
 
         `kind` is motor, position, velocity or other. Actuator models (`scene.entities.*.actuators`) are left out.
         """
@@ -211,7 +211,7 @@ class Entity:
             columns = self._index(field_columns[joints].tolist())
             if isinstance(columns, slice):
                 field, columns = field[:, columns], ALL
-            # the index stays referenced, so that Python does not give its id to another tensor
+            # the cache keeps the index alive: Python may give the id of a deleted tensor to a new one
             self._targets[key] = (joints, self.engine.as_field(field), columns)
         return self._targets[key][1:]
 

@@ -408,7 +408,7 @@ class EntityData:
             ids = self._entity.body_ids[bodies if isinstance(bodies, slice) else bodies.cpu().numpy()]
             index = (ids, model.body_rootid[ids])
             columns, roots = (evenly_spaced(part.tolist(), device) for part in index)
-            # the index stays referenced, so that Python does not give its id to another object
+            # the cache keeps the index alive: Python may give the id of a deleted object to a new one
             found = self._body_columns[id(bodies)] = bodies, columns, roots
         return found[1:]
 

@@ -17,9 +17,9 @@ from rlcli.scene.entity import Entity
 
 Points = NDArray[np.float64]
 VECTOR, PSEUDOVECTOR, QUATERNION = (1, -1, 1), (-1, 1, -1), (1, -1, 1, -1)
-"""Signs by which the columns of a quantity are multiplied to get its mirror image."""
+"""Signs by which the components of a quantity are multiplied to reflect the quantity about the x-z plane."""
 _TOLERANCE = 1e-3
-"""Largest distance of an element from the mirror image of its partner [m], and of two unit axes."""
+"""Largest distance between an element and the mirror image of its partner [m]; also the limit for unit axis vectors."""
 
 
 class EntityMirror:
@@ -51,7 +51,7 @@ class EntityMirror:
             if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE:
                 to_qpos[:, to_q : to_q + 7] = qpos[:, q : q + 7] * torch.tensor((*VECTOR, *QUATERNION))
                 to_qvel[:, to_v : to_v + 6] = qvel[:, v : v + 6] * torch.tensor((*VECTOR, *PSEUDOVECTOR))
-            else:  # a coordinate counts from the reference pose
+            else:  # relative to qpos0, the reference pose of the joint
                 to_qpos[:, to_q] = sign * (qpos[:, q] - model.qpos0[q]) + model.qpos0[to_q]
                 to_qvel[:, to_v] = sign * qvel[:, v]
 

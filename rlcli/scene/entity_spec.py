@@ -86,7 +86,10 @@ def entity_spec(
 
 
 def frame_of_start_pose(child: mujoco.MjSpec, entity: EntityConfig) -> tuple[FloatArray, FloatArray]:
-    """Return position and quaternion of the frame to which a model is attached, so that its root has its start pose."""
+    """Return the position and quaternion of the frame to which a model is attached.
+
+    The frame is chosen so that the root of the model has the start pose that the configuration gives.
+    """
     pos, quat = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
     element: Any = child.worldbody.first_body()
     while element is not None:  # the root, then the <frame> elements around it
@@ -100,7 +103,10 @@ def frame_of_start_pose(child: mujoco.MjSpec, entity: EntityConfig) -> tuple[Flo
 
 
 def write_masses(child: mujoco.MjSpec) -> None:
-    """Set the mass and inertia of every body of a model explicitly: attaching would lose the MJCF's `settotalmass`."""
+    """Write the computed mass and inertia of every body into the model.
+
+    Otherwise the MJCF's setting `settotalmass` would be lost when the model is attached to a scene.
+    """
     with warnings.catch_warnings(action="ignore"):  # MuJoCo has deprecated the attribute, but models still use it
         model = child.compile()
     for body in child.bodies[1:]:

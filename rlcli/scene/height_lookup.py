@@ -1,4 +1,7 @@
-"""Lookup of the height of points above a terrain, which ray sensors use instead of casting rays (`lookup: true`)."""
+"""Table of terrain heights, from which ray sensors read distances to the ground instead of casting rays.
+
+A ray sensor uses the table with `lookup: true`.
+"""
 
 from __future__ import annotations
 

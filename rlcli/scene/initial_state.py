@@ -38,7 +38,7 @@ def joint_speed_limits(entity: Entity) -> Tensor:
     limits = torch.full((len(names),), torch.inf)
     for motor in config.actuators.values():
         if motor.velocity_limit is not None:
-            with contextlib.suppress(NameProblem):  # making the actuator model reports it
+            with contextlib.suppress(NameProblem):  # building the actuator model reports the problem
                 joints = match(motor.joints, names, "joint")
                 limits[joints] = values_by_joint(motor.velocity_limit, [names[j] for j in joints])
     for joint, name in enumerate(names):

@@ -14,7 +14,7 @@ from rlcli.config.schema import EntityConfig, JointConfig
 from rlcli.scene.names import NameProblem, SceneProblem, match
 
 _KNOWN_ACTUATORS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtDyn.mjDYN_NONE), int(mujoco.mjtGain.mjGAIN_FIXED))
-"""Transmission, dynamics and gain of motor, position and velocity actuators."""
+"""Transmission, dynamics and gain types that rlcli's motor, position and velocity actuators can have."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""Search for joint angles that are probably in the wrong unit: degrees in a file in radians, or the reverse."""
+"""Check of an MJCF's joint limits for a wrong unit of angles: degrees read as radians, or radians read as degrees."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Estimate of the time and memory to compile an element of an untrusted MJCF, in units of an ordinary element."""
+"""Estimate of the cost (time and memory) of compiling an untrusted MJCF; an ordinary element costs 1."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 ENDLESS = 1e18
-"""Upper bound of counts of copies and of costs, so that products of a few of them stay finite."""
+"""Value to which costs and numbers of copies are limited, so that a product of a few of them does not overflow."""
 
 REFERENCES = {
     *(
@@ -26,9 +26,9 @@ REFERENCES = {
     *("joint", "joint1", "joint2", "jointinparent", "geom", "geom1", "geom2", "site", "site1", "site2", "sidesite"),
     *("cranksite", "slidersite", "refsite"),
 }
-"""Attributes by which sensors, actuators, tendons, equality constraints, pairs, tuples and skins name elements."""
+"""Attributes whose value is the name of another element: of sensors, actuators, tendons, constraints, tuples, skins."""
 _CHAIN = 4
-"""Longest chain of references: a tuple that refers to a sensor of the actuator of a tendon."""
+"""Length of the longest chain of references that is followed: tuple -> sensor -> actuator -> tendon."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +44,7 @@ class ModelCost:
     referring: float = 0.0
     """Number of elements such as sensors and actuators, which refer to others."""
     stored: dict[str, float] = field(default_factory=dict)
-    """Name -> size of the arrays of user numbers that MuJoCo stores with every element, such as `nuser_geom`."""
+    """Name of a size, such as `nuser_geom` -> number of user values that MuJoCo stores with each element (geom)."""
     keys: float = 0.0
     """Number of keyframes."""
     assets: float = 0.0
@@ -96,13 +96,13 @@ class References:
     _copies: dict[str, float] = field(default_factory=dict)
     """Name of an element -> its number of replicas."""
     _used: list[tuple[str, tuple[str, ...]]] = field(default_factory=list)
-    """Name of each referring element (or of its tendon, tuple or skin), and the names that it uses."""
+    """(name of an element that refers to others, or of the tendon, tuple or skin it is in; names of those others)."""
 
     def add(self, owner: str, attributes: dict[str, str], copies: float) -> None:
         """Add an element.
 
         Args:
-            owner: the name of the innermost open element that has one: of a tendon, for its joints.
+            owner: name of the element, or, if it has none, of the element around it, such as a joint's tendon.
             attributes: attributes of the element.
             copies: how often `replicate` copies it.
         """
@@ -132,7 +132,7 @@ class References:
 
 
 def stored_arrays(name: str, attributes: dict[str, str]) -> Iterator[tuple[str, float]]:
-    """Yield name and size of the arrays of numbers that MuJoCo stores with every element because of this element."""
+    """Yield (name, size) of the user-data arrays that MuJoCo enlarges for all elements because of this element."""
     if name == "size":
         for key in attributes:
             if key.startswith(("nuser_", "nkey")):

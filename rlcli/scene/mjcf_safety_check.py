@@ -1,4 +1,4 @@
-"""Scan of an untrusted MJCF before MuJoCo opens it: which files it loads, and how much it costs to compile."""
+"""Check of an untrusted MJCF before MuJoCo opens it: the files that it loads, and the cost of compiling it."""
 
 from __future__ import annotations
 
@@ -49,14 +49,14 @@ _LARGEST_NUMBER = 1e30
 _NOT_NEGATIVE = ("armature", "frictionloss")
 """Attributes of joints and tendons whose negative values are refused here; MuJoCo accepts them."""
 _PERHAPS_WRONG = re.compile(r"[-+]?(nan|inf)|[eE]\+?\d{2}|\d{30}", re.IGNORECASE)
-"""Parts of numbers that may be too large or not finite: nan, inf, an exponent of two digits, thirty digits."""
+"""Pattern of text that may be a number too large or not finite: nan, inf, an exponent of two digits, thirty digits."""
 _NAMES = REFERENCES | {
     *("name", "class", "childclass", "prefix", "model", "frame", "target", "instance", "plugin", "key", "material"),
     *("mesh", "hfield", "texture", "camera", "flex", "node"),
 }
 """Attributes that contain names, which may look like numbers, as `inf` does."""
 _FREE_SENSORS = ("clock", "e_potential", "e_kinetic", "user", "plugin")
-"""Sensors that may have no object."""
+"""Tags of sensors that need not refer to an element of the model."""
 
 
 class BadModel(ValueError):
@@ -73,11 +73,11 @@ class _Text:
     assets: float = 0.0
     """Cost of the meshes and images that it loads."""
     stored: dict[str, float] = field(default_factory=dict)
-    """Largest size of each array that MuJoCo stores with every element of the model, as for `ModelCost`."""
+    """Name -> largest size of the arrays that MuJoCo stores with every element of the model, see `ModelCost.stored`."""
     keys: float = 0.0
     """Number of keyframes, which store numbers of every joint."""
     replicas: float = 0.0
-    """Sum of the counts of the elements `replicate`."""
+    """Sum of the attribute `count` of all elements `replicate`."""
     free_sensors: int = 0
     """Number of sensors without an object, which MuJoCo doubles with every replica."""
     references: References = field(default_factory=References)
@@ -281,7 +281,7 @@ class MjcfScan:
             for key, value in attributes.items():
                 if not key.startswith("file") or not value:
                     continue
-                value = value.replace("\\", "/")  # as MuJoCo does on every system
+                value = value.replace("\\", "/")  # MuJoCo accepts both separators
                 if value.lower().endswith((".mjb", ".mjz", ".zip")):
                     raise BadModel(f"{file}:{line}: {name}: '{value}' is a compiled model; give its MJCF text")
                 if name in ("include", "model") or "xml" in attributes.get("content_type", ""):

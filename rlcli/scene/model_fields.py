@@ -31,7 +31,7 @@ FIELDS: dict[str, str] = {
     **dict.fromkeys(("pair_friction", "pair_solref", "pair_solimp", "pair_margin", "pair_gap"), "Pairs"),
     **dict.fromkeys(("opt.gravity",), ""),
 }
-"""Field -> kind of element of its rows; '' for the whole model. All other fields are the same in all environments."""
+"""Field that may differ between environments -> kind of element that its rows belong to; '' for the whole model."""
 
 DERIVED_FROM = {
     *("qpos0", "qpos_spring", "body_mass", "body_inertia", "body_ipos", "body_iquat", "body_pos", "body_quat"),

@@ -21,7 +21,7 @@ _TOKEN = re.compile(
     r"\\.|\[\^?\]?(?:\\.|[^\]\\])*\]|\{\d+(?:,\d*)?\}|\{,\d+\}|\((?:\?(?:P?<\w+>|P=\w+|[a-zA-Z-]*:|<?[=!]|>|[a-z]+))?|.",
     re.DOTALL,
 )
-"""An escape, a set, a count in braces, the start of a group, or any other character."""
+"""Pattern of a token in a regular expression: escape, set, count in braces, group start, or character."""
 
 
 class NameProblem(ValueError):
@@ -97,7 +97,7 @@ def search(pattern: str, names: Sequence[str], what: str) -> list[int]:
     _require_cheap(pattern, max(map(len, names), default=0))
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("error")  # warns of `[` within a set, which may become a nested set
+            warnings.simplefilter("error")  # Python warns about `[` within a set
             regex = re.compile(pattern)
     except (re.error, OverflowError, RecursionError, FutureWarning) as error:
         message = f"'{pattern}' is neither the name of a {what} nor a regular expression ({error}); correct it"

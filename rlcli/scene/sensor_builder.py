@@ -20,7 +20,7 @@ from rlcli.scene.terrain import TERRAIN_BODY, Ground
 _CONTACT_DATA = mujoco.mjtConDataField
 _FOUND_AND_FORCE = (1 << int(_CONTACT_DATA.mjCONDATA_FOUND)) | (1 << int(_CONTACT_DATA.mjCONDATA_FORCE))
 _NET_FORCE = 3
-"""Reduction `netforce` of a contact sensor, which adds up all contacts in the world frame."""
+"""Value of MuJoCo's contact-sensor option `reduce` with which it adds up all contact forces, in the world frame."""
 _DRAWN_GROUPS = (0, 1, 2)
 """Geom groups that viewers show by default."""
 
@@ -39,9 +39,9 @@ class ContactSensorSpec:
 
 @dataclass(frozen=True, slots=True)
 class RaySensorSpec:
-    """Ray sensor, as it was added to the model: the full name of its body, and the geom groups that rays hit.
+    """Ray sensor, as it was added to the model: the full name of its body, and the geom groups that rays can hit.
 
-    groups: None: all groups.
+    `groups` is None if rays can hit all groups.
     """
 
     config: RaySensorConfig
@@ -112,7 +112,10 @@ class SensorBuilder:
     def _contact_partners(
         self, config: ContactSensorConfig, path: tuple[str, ...]
     ) -> list[tuple[mujoco.mjtObj, str] | None]:
-        """Return (type, name) of each element whose contacts with the bodies are measured; None: any element."""
+        """Return (MuJoCo type, name) of the elements whose contacts with the sensor's bodies are measured.
+
+        The list is [None] if contacts with all elements are measured.
+        """
         against = config.against
         if against is None:
             return [None]
@@ -160,7 +163,7 @@ class SensorBuilder:
         return CameraSensorSpec(config, prefix + config.camera)
 
     def _body(self, entity: str, pattern: str | None, path: tuple[str, ...]) -> str:
-        """Return the full name, `entity/body`, of the only body that a pattern matches; of the root without one."""
+        """Return the full name, `entity/body`, of the one body that a pattern matches; without a pattern the root's."""
         bodies = self._bodies(entity, ".*" if pattern is None else pattern, path, "body")
         if pattern is not None and len(bodies) > 1:
             short = listing([body.removeprefix(f"{entity}/") for body in bodies])

@@ -1,4 +1,4 @@
-"""Kinds of ground (stairs, slopes, waves, ...): heights of one patch of terrain, or the blocks of which it consists.
+"""Generators of the kinds of ground (stairs, slopes, waves, ...), each for one patch (square piece) of a terrain.
 
 A patch is an array of heights [m] at the corners of its cells, with x along the first axis. The heights along its edges
 are 0, so that any two patches fit together.

@@ -35,13 +35,13 @@ _MAX_PARTS = 2000
 _START, _MOVE = random.stream("terrain.start"), random.stream("terrain.move")
 _SCATTER = random.stream("terrain.scatter")
 _SPAWN_HALF_WIDTH = 0.5
-"""Half the edge of the square in the middle of a patch whose highest point gives the height of its origin [m]."""
+"""Half the edge of the square in the middle of a patch whose highest point is the height of the start position [m]."""
 _THICKNESS = 0.5
 """Thickness of the ground below its lowest point [m]."""
 _BOX, _HFIELD = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_HFIELD
 
 TerrainProblem = tuple[tuple[str, ...], str, str | None]
-"""Problem of a terrain's configuration: its key below scene.terrain, message, hint."""
+"""Mistake in a terrain's configuration: (key below scene.terrain, message, hint)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,7 +155,7 @@ class Terrain:
     ) -> None:
         device, count = origins.device, len(origins)
         self.origins = torch.from_numpy(ground.origins).to(device)
-        """Start position on each patch. (rows, columns, 3) [m]"""
+        """Start position on each patch, world frame. (rows, columns, 3) [m]"""
         self._streams = streams
         self.types = torch.from_numpy(streams).to(device) % self.origins.shape[1]
         """Terrain type (column of patches) of each environment. (num_envs,) int64"""

@@ -36,7 +36,7 @@ TIME_S = 10
 _MAX_ITERATIONS = 100_000
 _MAX_GRAVITY = 10_000
 _compiled: set[tuple[object, ...]] = set()
-"""Files of the scenes that a subprocess has compiled, with their versions; they are not compiled again."""
+"""Scenes that a subprocess has compiled without an error, as their files with versions; they need no second check."""
 MUJOCO_ERRORS = (ValueError, RuntimeError, MemoryError, mujoco.FatalError, mujoco.UnexpectedError)
 """Exceptions that MuJoCo raises for a model that it cannot read or compile."""
 
@@ -83,7 +83,7 @@ def check_mjcf(file: Path, roots: Sequence[Path], *, installed: bool = False) ->
 
 @dataclass(slots=True)
 class ModelsTogether:
-    """Models of the entities of one scene, and their cost together, which is limited.
+    """Check of all models of one scene together: the sum of their costs is limited.
 
     Models of installed packages are not counted.
     """
@@ -141,7 +141,7 @@ def open_mjcf(checked: CheckedModel, *, compiled: bool = False) -> mujoco.MjSpec
     except MUJOCO_ERRORS as error:
         if too_little := memory_error(error):
             raise too_little from None
-        message = one_line(error).replace(", line 0", "")  # MuJoCo's line of elements of included files
+        message = one_line(error).replace(", line 0", "")  # MuJoCo names line 0 for elements of included files
         raise BadModel(f"{checked.scan.file_of(str(error))}: {message}") from None
     _check_options(spec, file)
     return spec

@@ -1,4 +1,5 @@
-"""Physics engines. An engine steps many worlds (simulations) of one model, one for each environment.
+"""Physics engines, on the CPU (`batch`) and on the GPU (`warp`), and helpers for their states.
 
-A `Selection` is a part of the worlds, such as those to reset, with random numbers for them.
+An engine steps many worlds (simulations) of one model, one world for each environment. A `Selection` is a subset of the
+worlds, such as those to reset, and draws random numbers for them.
 """

@@ -1,4 +1,4 @@
-"""Fields and sensors that MuJoCo computes in the acceleration stage of a step: forces and accelerations."""
+"""Lists of the MjData fields and sensors that MuJoCo computes in the last stage of a step: forces, accelerations."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def add_body_forces(spec: mujoco.MjSpec) -> None:
 
 
 def force_sensor_columns(model: mujoco.MjModel) -> list[int]:
-    """Return the columns of `sensordata` that the acceleration stage computes: forces and accelerations."""
+    """Return the columns of `sensordata` with readings of forces or accelerations (the acceleration stage)."""
     acceleration = int(mujoco.mjtStage.mjSTAGE_ACC)
     return sensor_columns(model, np.flatnonzero(model.sensor_needstage == acceleration).tolist())
 

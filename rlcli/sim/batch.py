@@ -70,7 +70,7 @@ class BatchEngine(BatchWorlds):
             self.state_layout, self._rows, self._batch.warning, self._expanded, self._max_velocity
         )
         self._bound_inputs: list[NDArray[np.float64]] = []
-        """Fields of the state, other than positions and velocities, that code has requested and may write."""
+        """Names of state fields, except positions and velocities, that terms have requested and may write to."""
         self._substep_fields = config.derived_fields == "substep"
         self.step_stage = _NONE
         """Stage (mjtStage) up to which derived fields are computed after the last physics step of a call."""
@@ -111,7 +111,7 @@ class BatchEngine(BatchWorlds):
                 if not self._substep_fields and not self._only_of_acceleration_stage(name):
                     self.step_stage = _VEL
                     self._forward_stage = max(self._forward_stage, _VEL)
-                self._forward_all()  # before it, the new field holds zeros
+                self._forward_all()  # without this computation the new field would hold zeros
             self._fields[name] = bound
             if name in STATE_FIELDS:
                 if self.state_layout.columns(name).stop > self.history.width:
@@ -167,7 +167,7 @@ class BatchEngine(BatchWorlds):
         warned = np.count_nonzero(self._warning_words) > 0
         finite = motion_is_finite and self._only_motion
         finite = finite and all([math.isfinite(np.add.reduce(values, axis=None)) for values in self._bound_inputs])
-        # the sum of whole rows is faster than a sum without the columns that never change
+        # some columns never change, but a sum of whole rows is faster than a sum without these columns
         finite = finite or math.isfinite(self._state.sum().item()) or bool(self._state.isfinite().all())
         fast = self._max_velocity < report.STATE_LIMIT and bool((np.abs(self._qvel) > self._max_velocity).any())
         if not warned and finite and not self._error and not fast:
@@ -287,7 +287,7 @@ class BatchEngine(BatchWorlds):
         super().load_state_dict(state)
         substep = substate(state, "substep.")
         for name in substep:
-            self.field(name)  # bind it here too; it was bound when the state was saved
+            self.field(name)  # request the field here too: it was requested when the state was saved
         if self._forward_stage != _NONE:
             with without_profiler:
                 self._batch.forward(stage=self._forward_stage)
@@ -306,13 +306,13 @@ class BatchEngine(BatchWorlds):
             self._fields[name].copy_(value)
 
     def _only_of_acceleration_stage(self, name: str) -> bool:
-        """Return whether MuJoCo computes the whole field (for `sensordata`: every sensor) in the acceleration stage."""
+        """Return whether MuJoCo computes the whole field in the acceleration stage; `sensordata`: all its sensors."""
         if name == "sensordata":
             return len(self._force_sensors) == int(self.model.nsensordata)
         return name in ACCELERATION_FIELDS
 
     def _of_substep(self, name: str) -> bool:
-        """Return whether a field has values of the last physics step, such as forces, which no state determines."""
+        """Return whether a field has values of the last physics step that no state determines, such as forces."""
         if name in ACCELERATION_FIELDS or (name == "sensordata" and self._force_sensors):
             return True
         return bool(self._substep_fields) and name not in STATE_FIELDS

@@ -38,7 +38,7 @@ _FLAGS = {
 }
 """Integer fields of a model that are flags: no value of them can make MuJoCo read outside of its arrays."""
 _MIN_STATES_PER_ENV = 3
-"""Smallest memory of an environment, as a number of integration states; the built-in tasks need 3.3 to 16."""
+"""Lower bound of an environment's memory, in multiples of its integration state; built-in tasks need 3.3 to 16."""
 
 
 class BatchWorlds:
@@ -208,7 +208,7 @@ class BatchWorlds:
         self.history = StateHistory(self._rows, width, self._default, calls, memory=memory, count=count)
 
     def _skip_nothing(self) -> None:
-        """Stop skipping computations: from now on, only the disable flags of the original model hold."""
+        """Compute everything from now on: set the disable flags back to those of the original model."""
         if self._skipped:
             self._skipped = 0
             expand_disable_flags(self._batch)[:] = self._disable_flags

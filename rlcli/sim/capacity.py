@@ -11,7 +11,7 @@ from rlcli.sim.skippable_work import colliding_pairs
 
 _TRIALS, _STEPS = 16, 100
 _MARGIN = 3
-"""Factor by which the capacity exceeds the largest number in short random simulations."""
+"""Safety factor: the capacity is this factor times the largest number found in short random simulations."""
 _DEFAULT_CONTACTS = 8
 """Largest number of contacts of a pair of geoms that is not in `_PAIR_CONTACTS`, such as two boxes."""
 _HFIELD_CONTACTS = 50

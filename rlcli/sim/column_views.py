@@ -1,4 +1,7 @@
-"""Indices of columns in a tensor, such as those of some joints: slices where possible, which give views, not copies."""
+"""Conversion of column positions (such as those of some joints) to an index into a tensor.
+
+The index is a slice where possible, because indexing with a slice gives a view instead of a copy.
+"""
 
 from __future__ import annotations
 
@@ -60,6 +63,6 @@ class CachedViews:
         if isinstance(joints, slice):  # a tensor index gives a copy, which must not be cached
             if len(self._views) >= MAX_CACHED_VIEWS:
                 self._views.clear()
-            # the index stays referenced, so that Python does not give its id to another object
+            # the cache keeps the index alive: Python may give the id of a deleted object to a new one
             self._views[id(joints)] = joints, values, part
         return part

@@ -1,4 +1,4 @@
-"""Divergences of simulations: their causes, and the engine calls before them."""
+"""Description of diverged simulations: the cause, and the recorded engine calls before the divergence."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ TOO_FAST = "qvel out of bounds"
 HISTORY_MEMORY = 64 * 2**20
 """Default memory limit of a `StateHistory` [bytes]."""
 MORE_MEMORY = "if the contact arena is full, set a larger <size memory=...> in the MJCF"
-"""Hint for an engine error, whose usual cause is too little memory for contacts."""
+"""Hint for an error of the engine; its usual cause is too little memory for contacts."""
 WARNING_FIELDS = {"BADCTRL": "ctrl", "BADQPOS": "qpos", "BADQVEL": "qvel", "BADQACC": "qacc"}
-"""Warning of a divergence -> field of MjData; the index that MuJoCo stores with the warning is one of this field."""
+"""MuJoCo warning that means divergence -> MjData field to which the index stored with the warning belongs."""
 DIVERGENCE_WARNINGS = {name: int(getattr(mujoco.mjtWarning, f"mjWARN_{name}")) for name in WARNING_FIELDS}
 """Warnings after which MuJoCo resets a world or ignores its controls; the first of several is the cause."""
 OTHER_WARNINGS = {
@@ -51,7 +51,7 @@ class Divergence:
     cause: str
     """MuJoCo's warning without its prefix (`BADQACC`), `FIELD not finite`, `FIELD out of bounds`, or `engine error`."""
     detail: str = ""
-    """Element of the model in which the divergence was detected, and its source; or the engine's error message."""
+    """Element of the model (such as a joint) where the divergence was found and its cause, or the engine's error."""
     index: int = -1
     """Index of the bad value in the field of the warning or in `qvel`; -1 if unknown."""
 

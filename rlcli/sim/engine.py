@@ -149,7 +149,10 @@ class Engine(EngineView, Protocol):
         """Set the joint state that `reset` restores. (nq,), (nv,)"""
 
     def as_field(self, tensor: Tensor) -> Field:
-        """Return a tensor in the form that `Selection.write` writes fastest: on a CPU, a NumPy array of its memory."""
+        """Return a tensor in the form that `Selection.write` writes fastest.
+
+        On a CPU this is a NumPy array that shares the tensor's memory, on a GPU the tensor itself.
+        """
 
     def select(self, mask: Field, seed: int, counters: Field) -> Selection | None:
         """Return a selection of the worlds where `mask` is true; None if it is known to be empty.

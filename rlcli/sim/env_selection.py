@@ -28,7 +28,7 @@ ALL = slice(None)
 """Index of all columns."""
 DEFAULT_STREAM = np.uint64(0)
 _FEW_ROWS, _AHEAD = 16, 8
-"""A selection of at most `_FEW_ROWS` rows computes `_AHEAD` random numbers for each row at once."""
+"""A selection of at most `_FEW_ROWS` rows draws `_AHEAD` random numbers per row in advance, which is faster."""
 
 
 def in_place(tensor: Tensor) -> Any:
@@ -154,7 +154,7 @@ class IdSelection:
     _keys: random.Keys | None = field(default=None, init=False)
     _drawn: int = field(default=0, init=False)
     _ready: tuple[int, NDArray[np.float32] | None] = field(default=(0, None), init=False)
-    """(index of the first number, uniform numbers computed in advance for each row). (rows, n)"""
+    """Uniform numbers drawn in advance: (index of the first number in the random stream, numbers (rows, n))."""
 
     @property
     def count(self) -> int:

@@ -1,4 +1,4 @@
-"""Choice of the OpenGL library, made when the first image is rendered.
+"""Opening of an OpenGL context for rendering; the OpenGL library is chosen when the first image is rendered.
 
 If MUJOCO_GL is not set: the OpenGL of the display if there is a display, else EGL, else OSMesa.
 """
@@ -17,7 +17,7 @@ from rlcli.machine.memory import require_address_space
 
 _PACKAGES = {"egl": "libegl1", "osmesa": "libosmesa6", "glfw": "a running display server"}
 _ADDRESS_SPACE = 2 << 30
-"""Limit of a process [bytes] below which OpenGL fails with errors that do not name the memory."""
+"""Memory limit of a process (`ulimit -v`) [bytes] below which OpenGL fails with errors that do not mention memory."""
 
 
 def opengl_import_error(error: BaseException) -> MachineError | None:

@@ -42,7 +42,7 @@ def _private(owner: object, name: str) -> Any:
 
 
 STATE_FIELDS: dict[str, mujoco.mjtState] = _private(mujoco.batch, "_STATE_FIELDS")
-"""Field of MjData that belongs to the integration state -> its component of the state."""
+"""Field of MjData that is part of the integration state -> MuJoCo's flag (mjtState) for this part."""
 
 
 def make_batch(

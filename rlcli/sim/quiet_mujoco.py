@@ -1,4 +1,4 @@
-"""Settings of MuJoCo's log."""
+"""Function that turns off MuJoCo's log file and its warnings on the terminal."""
 
 from __future__ import annotations
 

@@ -104,7 +104,7 @@ def _axis_tables(device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def roll_pitch_yaw(quat: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the angles about the fixed axes x, y (within +-pi/2) and z, see `from_euler` [rad]. (..., 4) -> (...)"""
+    """Return roll, pitch (within +-pi/2) and yaw, the angles for `from_euler` [rad]. (..., 4) -> (...) each"""
     w, x, y, z = quat.unbind(-1)
     roll = atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
     pitch = torch.asin((2.0 * (w * y - z * x)).clamp_(-1.0, 1.0))
@@ -123,7 +123,7 @@ def length(vector: Tensor) -> Tensor:
 
 
 def rotation_vector(quat: Tensor) -> Tensor:
-    """Return axis x angle, with the angle in [0, pi] [rad]. (n, 4) -> (n, 3)"""
+    """Return the rotation vector: unit axis times angle, with the angle in [0, pi] [rad]. (n, 4) -> (n, 3)"""
     w, axis = unique(quat).split_with_sizes([1, 3], dim=1)
     x, y, z = axis.unbind(1)
     sine = (x * x + y * y + z * z).sqrt()[:, None]

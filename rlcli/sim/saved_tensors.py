@@ -1,4 +1,4 @@
-"""State of objects as named tensors, and checks of saved tensors before they are restored."""
+"""Base class for objects whose state is saved as named tensors, and checks of saved tensors before their use."""
 
 from __future__ import annotations
 

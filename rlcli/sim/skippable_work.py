@@ -1,4 +1,4 @@
-"""Computations that MuJoCo can skip in a step without changing a bit of the state.
+"""Choice of the computations that MuJoCo can skip in a step of a certain model, without changing a bit of the state.
 
 MuJoCo prepares collision detection even if no two geoms may touch, it prepares constraints even if the model can have
 none, and it searches constraint islands even in a model of one kinematic tree, which is one island. Its Python bindings

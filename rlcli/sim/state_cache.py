@@ -1,4 +1,7 @@
-"""Copy of the engine's state in float32: joint states are copied once per step, derived fields when they are read."""
+"""Copy of the engine's state in float32, from which the terms of a task read.
+
+Joint positions and velocities are copied once per step, derived fields such as xpos when a term reads them.
+"""
 
 from __future__ import annotations
 
@@ -68,7 +71,7 @@ class SimData:
 
     def refresh(self) -> None:
         """Copy the joint state of every world from the engine."""
-        with np.errstate(over="ignore"):  # infinity in float32: `is_finite` finds it
+        with np.errstate(over="ignore"):  # a value too large for float32 becomes infinity, which `is_finite` finds
             for copy, source in self._copied:
                 copy[...] = source
         self.stamp += 1

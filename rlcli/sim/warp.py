@@ -46,7 +46,7 @@ class WarpEngine(WarpWorlds):
     threads = 1
     asynchronous = True
     replayable = None
-    """None: steps on a GPU are not bit-identical when they are repeated."""
+    """None, because steps on a GPU are not bit-identical when they are repeated."""
 
     def __init__(self, model: mujoco.MjModel, num_envs: int, config: SimConfig, device: str) -> None:
         super().__init__(model, num_envs, config, device)
@@ -57,7 +57,7 @@ class WarpEngine(WarpWorlds):
         self._max_velocity = config.max_velocity or STATE_LIMIT
         self._force_columns = as_index(force_sensor_columns(model), self.device)
         self._ray_buffers: dict[tuple[int, int], tuple[wp.array, wp.array, wp.array]] = {}
-        """(Number of rays, excluded body) -> excluded body of each ray, buffers for geoms and normals at the hits."""
+        """(number of rays, excluded body) -> buffers of `rays`: excluded body, geom and normal of each ray."""
         self._checked: list[str] = []
         """Names of the values passed to `check_finite`; the index of a name is the index of its flag."""
         with self._setting_up():

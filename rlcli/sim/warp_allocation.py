@@ -1,4 +1,4 @@
-"""Memory of the GPU engine: model and worlds on the device, and the capacity for contacts and constraints."""
+"""Allocation of the GPU engine's memory: model, worlds, and the capacity for contacts and constraints."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def put_on_device(
 
 
 def overflow_error(found: int, capacity: Capacity) -> DivergedError:
-    """Return the error for exceeded capacities: the sum of keys of `OVERFLOW_SETTINGS` in `found`."""
+    """Return the error for exceeded capacities; `found` is the sum of their flags, the keys of `OVERFLOW_SETTINGS`."""
     settings = {setting for bit, setting in OVERFLOW_SETTINGS.items() if found & int(bit)}
     kinds = " and ".join(bit.name.lower() for bit in OVERFLOW_SETTINGS if found & int(bit) and bit.name)
     now = {"contacts_per_env": capacity.contacts, "constraints_per_env": capacity.constraints}

@@ -62,7 +62,7 @@ class WarpWorlds:
         self._last_derived: dict[str, Tensor] = {}
         """Derived fields of each world's last state that did not diverge."""
         self._derived: set[int] = set()
-        """Stages that compute requested derived fields."""
+        """Stages of a MuJoCo step that have to run, because they compute a requested derived field."""
         self._needs_only_motion = True
         """Whether the requested fields can be derived from positions and velocities, without contacts and inertias."""
         self._overwritten: dict[str, wp.array] = {}
@@ -171,7 +171,7 @@ class WarpWorlds:
             self.expand(name).copy_(values)
         substep = substate(state, "substep.")
         for name in substep:
-            self.field(name)  # from now on in use, as it was when the state was saved
+            self.field(name)  # request the field: it was requested when the state was saved
         for name, values in state.items():
             if name in (*STATE, *INPUTS):
                 self.field(name).copy_(values)
@@ -237,7 +237,7 @@ class WarpWorlds:
             mjw.sensor_vel(m, d)
 
     def _of_substep(self) -> list[str]:
-        """Return the requested fields, such as forces, that no state determines: they are of the last physics step."""
+        """Return the requested fields with values of the last physics step, which the state does not determine."""
         stages = {name: self._stages.stages_of(name) for name in self._fields}
         return [name for name, groups in stages.items() if FORCE in groups or (self._substep_fields and groups)]
 

@@ -128,8 +128,8 @@ class TaskConfig(StrictModel):
     params: dict[str, Any] = {}
     """Parameters of a direct task, checked by the class `Params` of the task."""
     foreign: dict[str, dict[str, Any]] = {}
-    """Key of another framework's format -> settings that only the format's environment reads. A file has the format's
-    key, such as `oige`, at the top level, without `foreign`."""
+    """Settings of task files in another framework's format that only the environment of this format reads: key of the
+    format -> settings. In a file the key of the format, such as `oige`, is at the top level, without `foreign`."""
     clip_actions: Positive | None = None
     """Direct tasks: actions are clamped to +-`clip_actions` before pre_physics_step; null: not clamped."""
     clip_observations: Positive | None = None

@@ -1,1 +1,4 @@
-"""Environments in shards: each worker process steps a part of them; results are bit-identical to one process."""
+"""Parallel stepping of environments: each worker process steps a part (shard) of them.
+
+All results are bit-identical to those of a single process.
+"""

@@ -1,4 +1,7 @@
-"""One engine object for environments in several processes, for observers, recordings and reports."""
+"""Object with the interface of one physics engine, for environments whose engines run in several processes.
+
+Observers, recordings and reports use it like the engine of a single process.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Environment whose parts are stepped by several processes at the same time."""
+"""Environment (`ShardedEnv`) whose parts are stepped by several processes at the same time."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ class ShardedEnv(Environment):
         self._slot = 0
         self._episodes: Episodes | None = None
         self._waiting: dict[Worker, tuple[Stage, Any]] = {}
-        """Workers that wait for other shards -> the stage that they have reached, and the data that they sent."""
+        """Worker that waits for other shards -> the stage of the step that it has reached, and the data it sent."""
         self._stage: Stage | None = None
         """Stage whose observers are running; None: no observers are running."""
         self._is_broken = False
@@ -364,7 +364,9 @@ class ShardedEnv(Environment):
         return {name: self._joined_metric([part[name] for part in parts]) for name in parts[0]}
 
     def _joined_metric(self, parts: Sequence[Tensor]) -> Tensor:
-        """Return a metric's values of all environments; if each shard has a single value, their weighted mean.
+        """Return the values of a metric for all environments, joined from the shards.
+
+        If each shard has a single value instead of one for each environment, return the weighted mean of these values.
 
         The weights are the numbers of environments.
         """

@@ -26,9 +26,9 @@ from rlcli.sim.divergence_report import Divergence
 SLOTS = 3
 """Number of shared buffers for results: the result of a step stays valid until the step after the next one."""
 _FIXED_COLUMNS = 4
-"""Number of columns of every finished episode: environment, return, length, truncated. `Columns` names the others."""
+"""Number of values that every finished episode has: environment, return, length, truncated."""
 _MAX_COLUMNS = 256
-"""Largest number of columns of a finished episode, besides its reward terms."""
+"""Number of values that a finished episode may have at most, without its reward terms."""
 
 
 class Stage(enum.IntEnum):
@@ -100,7 +100,8 @@ def array_specs(env: VecEnv, total: int, shards: int) -> dict[str, ArraySpec]:
     floats, flags = torch.float32, torch.bool
     return {
         **counter_specs(total),
-        "command": ArraySpec((8,), torch.int64),  # slot, Needs, final_obs_of is truncated, some env restarts; unused
+        # slot, Needs, whether final_obs_of is "truncated", whether an environment restarts; the rest is unused
+        "command": ArraySpec((8,), torch.int64),
         "action": ArraySpec((total, layout.action_size), floats),
         "restart": ArraySpec((total,), flags),
         **{f"obs.{group}": ArraySpec((SLOTS, total, size), floats) for group, size in sizes.items()},
@@ -110,8 +111,10 @@ def array_specs(env: VecEnv, total: int, shards: int) -> dict[str, ArraySpec]:
         "truncated": ArraySpec((SLOTS, total), flags),
         "reward_terms": ArraySpec((terms, total), floats),
         "episodes": ArraySpec((_MAX_COLUMNS + terms, total), torch.float64),
-        "counts": ArraySpec((shards, 8), torch.int64),  # finished episodes, final_obs is valid; unused
-        "seconds": ArraySpec((shards, 8), torch.float64),  # physics, step; unused
+        # number of finished episodes, whether final_obs is valid; the rest is unused
+        "counts": ArraySpec((shards, 8), torch.int64),
+        # duration of the physics and of the whole step [s]; the rest is unused
+        "seconds": ArraySpec((shards, 8), torch.float64),
     }
 
 
@@ -297,9 +300,10 @@ def read_episodes(
 
 
 def _with_causes(part: NDArray[np.float64], names: Columns, widest: Columns) -> NDArray[np.float64]:
-    """Return a shard's columns of episodes with the causes of `widest`: zeros for a cause that the shard lacks.
+    """Return a shard's values of finished episodes, with a column for every cause in `widest`.
 
-    A cause such as a divergence is a column only in shards in which it has occurred.
+    A shard has a column for a cause of an episode's end, such as a divergence, only if this cause has occurred in it.
+    A missing column is filled with zeros.
 
     Args:
         part: values of the shard's finished episodes, one row for each column.

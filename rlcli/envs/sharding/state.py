@@ -1,4 +1,4 @@
-"""Join the states of shards into one environment state, and split an environment state into states of shards."""
+"""Functions that join the saved states of shards into the state of one environment, and split such a state again."""
 
 from __future__ import annotations
 
@@ -72,5 +72,8 @@ def split_state(
 
 
 def _first_dim(value: Tensor, total: int) -> int | None:
-    """Return 0 if a tensor has `total` rows, else None: the guess for a tensor that the current state does not have."""
+    """Return the environment dimension of a tensor that the current state does not have, by a guess.
+
+    It is 0 if the tensor has `total` rows, one for each environment; else None.
+    """
     return 0 if value.shape[:1] == (total,) else None

@@ -1,4 +1,4 @@
-"""`make_training_env`, which builds the environment of a training, in one process or in several."""
+"""Function `make_training_env`, which builds the environment of a training, in one process or in several."""
 
 from __future__ import annotations
 

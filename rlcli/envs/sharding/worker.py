@@ -1,4 +1,4 @@
-"""Worker process: it steps one shard until the main process closes the connection or ends."""
+"""Main function of a worker process, which steps one shard until the main process closes the connection or ends."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ warning, which may come at any time."""
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """Everything from which a worker builds its shard."""
+    """Data that a worker receives once, and from which it builds its shard."""
 
     resolved: bytes
     """Configuration of the shard, pickled."""
@@ -232,7 +232,7 @@ class _GlobalGenerators:
 
 @dataclass(frozen=True, slots=True)
 class _PortableError:
-    """An exception in a form that can be pickled."""
+    """Copy of an exception that can be pickled, so that a worker can send it to the main process."""
 
     kind: type[BaseException]
     arguments: tuple[Any, ...]
@@ -241,7 +241,7 @@ class _PortableError:
 
     @staticmethod
     def from_exception(error: BaseException, broken: TaskError | None = None) -> _PortableError:
-        """Return an exception in a form that can be pickled.
+        """Return the copy of an exception that a worker sends.
 
         An exception in the task's code becomes a TaskError that names the line of code. `broken` replaces an exception
         that would be reported as a bug of rlcli: a task has broken built-in functions.

@@ -1,4 +1,7 @@
-"""Number of worker processes of an environment. This module imports neither torch nor MuJoCo."""
+"""Choice and check of the number of worker processes of an environment (`scene.workers`).
+
+The module imports neither torch nor MuJoCo, so that workers can be started before these slow imports.
+"""
 
 from __future__ import annotations
 
@@ -11,16 +14,16 @@ from rlcli.machine.cores import available_cores
 from rlcli.machine.memory import available_memory
 
 ENVS_PER_WORKER = 512
-"""Fewest environments per process that `auto` allows: with fewer, the fixed cost of a process outweighs its gain."""
+"""Smallest number of environments per process with `scene.workers: auto`: below it more processes are not faster."""
 FEWEST_WORKERS = 4
-"""Fewest processes that `auto` uses instead of one: two or three are not faster than one with all cores."""
+"""`scene.workers: auto` uses one process or at least this number: two or three are not faster than one."""
 
 FREE_MEMORY_PER_WORKER = 1 << 30
 """Free memory for each process that `auto` starts [bytes]; a process takes about a quarter of it."""
 ONE_WORKER = "RLCLI_ONE_WORKER"
 """Environment variable that is set for trainings that run at the same time: `scene.workers: auto` is then 1."""
 FEWEST_CORES = 4
-"""Fewest cores with which `auto` uses several processes: on fewer, physics already takes most of a step."""
+"""Number of cores from which `auto` uses several processes: on fewer cores physics takes most of a step anyway."""
 _TESTED = ("rlcli", "rlcli-gymnasium", "rlcli-menagerie")
 """Distributions whose tasks are tested with several workers."""
 

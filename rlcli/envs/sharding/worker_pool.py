@@ -1,4 +1,4 @@
-"""Start, use and end the worker processes of an environment from the main process."""
+"""Pool of an environment's worker processes, as the main process starts, uses and ends them."""
 
 from __future__ import annotations
 
