@@ -188,9 +188,7 @@ def signature_of(term: Any, name: str) -> Signature:
 
 
 def read_params(file: Path, class_name: str) -> type[schema.StrictModel] | None:
-    """Return a pydantic model with the fields of a direct task's class `Params`; None if the task has no `Params`.
-
-    The model is made from the source code, which is not imported.
+    """Return a model with the fields of a direct task's class `Params`, read from its source code; None without it.
 
     `Params` is inside of the task's class or of one of its base classes.
 

@@ -87,10 +87,7 @@ class TaskCheck:
     places: dict[Path, str] = field(default_factory=dict)  # `PythonTask.places`
 
     def document(self, changes: Iterable[Change] = ()) -> Document:
-        """Return the content of the task's file.
-
-        For a configuration in Python, `changes` supply its model files and the required values that it leaves open.
-        """
+        """Return the content of the task's file; for one in Python, `changes` supply models and required values."""
         file = self.source.config  # YAML: a task, or the record of a run
         recorded = upgraded(read(file, self.source.label), file) if file.suffix != ".py" else None
         if recorded is not None and self.source.python is None and self.source.value is None:

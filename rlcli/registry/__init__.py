@@ -1,4 +1,4 @@
-"""Registry of the installed tasks, trainers and formats (of other frameworks' task files), by name.
+"""Search for installed tasks, trainers and formats (readers of other frameworks' task files) by name, and their import.
 
 The names come from the metadata of installed packages; a plugin is imported only when it is used.
 """

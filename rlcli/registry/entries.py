@@ -31,8 +31,10 @@ MAX_ENTRIES = {TASKS: 1000, TRAINERS: 50, FORMATS: 50}
 """Largest number of entry points that a distribution may have in each group; every command loads all formats."""
 
 _entry_points: Any = vars(metadata.Distribution)["entry_points"].fget
-"""The original getter of the standard library. It raises for malformed metadata, also inside of
-`malformed_metadata_ignored`."""
+"""Function of the standard library that returns a distribution's entry points; raises for malformed metadata.
+
+Inside of `malformed_metadata_ignored` the library has a replacement, so the original function is kept here.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,7 +193,10 @@ def unknown_wanted() -> str:
 
 
 def plugins_chosen_by() -> str:
-    """Return where the user chose the plugins, for messages: RLCLI_PLUGINS, or the key `plugins` of a settings file."""
+    """Return, as text for messages, which setting chooses the enabled plugins.
+
+    It is the environment variable RLCLI_PLUGINS, or the key `plugins` in the settings file.
+    """
     return "RLCLI_PLUGINS" if os.environ.get("RLCLI_PLUGINS", "").strip() else f"the key 'plugins' in {settings_file()}"
 
 

@@ -1,6 +1,6 @@
-"""Replacements of modules whose import failed in a package that registers several tasks.
+"""Placeholders for modules whose import failed in a package that registers several tasks.
 
-With the replacement, the other tasks of the package can still be used; the error is raised if the module is used.
+With the placeholder, the other tasks of the package can still be used; its use raises the error of the import.
 """
 
 import logging
@@ -14,9 +14,9 @@ from rlcli.registry.module_names import with_own_names
 
 _log = logging.getLogger(__name__)
 _failures: dict[str, Exception] = {}
-"""Name of a module -> the error of its import, for imports whose warning was not printed yet."""
+"""Failed imports about which no warning was printed yet: name of the module -> error of the import."""
 _LIBRARIES = tuple(path for name, path in sysconfig.get_paths().items() if name.endswith(("lib", "stdlib")))
-"""Folders of Python's and of installed libraries."""
+"""Folders of Python's standard library and of installed packages."""
 
 
 class FailedImport:

@@ -12,7 +12,7 @@ from rlcli.registry.locate_installed_tasks import installed_task, task_of_file
 from rlcli.registry.task_location import TaskSource
 
 KEYWORDS = ("latest", "shipped")
-"""Words that name the newest run (`latest`) and the policy that a task ships (`shipped`), never a folder."""
+"""Keywords for the newest run (`latest`) and for the policy that a task ships (`shipped`); they never name a folder."""
 
 
 def path_of(word: str) -> Path:

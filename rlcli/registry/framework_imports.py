@@ -1,4 +1,4 @@
-"""Imports in task files of another framework: its modules are replaced by the ones that a format's plugin brings.
+"""Import system for task files of another framework, whose modules a format's plugin replaces by its own.
 
 For example, `import isaaclab.envs` in a task file imports a module of the plugin. The files of a task are executed with
 their own `__import__`, also when their functions import something later. No other code uses it, and `sys.modules` never
@@ -55,7 +55,10 @@ class TaskFileLoader(SourceFileLoader):
 
 
 def _without_gpu(file: str) -> contextlib.AbstractContextManager[Any]:
-    """Return the context in which a file is executed: if it names `cuda` and there is no GPU, with the CPU for it."""
+    """Return the context manager in which a task file is executed.
+
+    If the file names the device `cuda` and this machine has no GPU, the context uses the CPU in its place.
+    """
     if b"cuda" in Path(file).read_bytes():
         import torch
 
@@ -67,7 +70,7 @@ def _without_gpu(file: str) -> contextlib.AbstractContextManager[Any]:
 
 
 class _KnownFileLoader(Loader):
-    """Loader of a task file that was already imported under another name: it returns the same module object."""
+    """Loader for a task file that was imported before under another name; it returns the same module object again."""
 
     def __init__(self, known: ModuleType) -> None:
         self._known, self._spec = known, known.__spec__
@@ -77,7 +80,7 @@ class _KnownFileLoader(Loader):
         return self._known
 
     def exec_module(self, module: ModuleType) -> None:
-        """Execute nothing; restore the `__spec__` of the module, which the import system has changed."""
+        """Restore the attribute `__spec__` of the module, which the import system has changed; run no code."""
         module.__spec__ = self._spec
 
 
@@ -362,7 +365,7 @@ def _formats_for(first: str, file: str) -> tuple[Format, ...]:
         root = next((root for root in _roots if Path(file).is_relative_to(root)), Path(file).parent)
         files = sorted(root.rglob("*.py"))[:_MOST_FILES]
         counts = {name: sum(_imports(str(path), aliases) for path in files) for name, aliases in own.items()}
-    most = max(counts.values())  # other formats have no part in the task
+    most = max(counts.values())  # only this format can belong to the task
     return tuple(form for form in forms if counts[form.name] == most)
 
 

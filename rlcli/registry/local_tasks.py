@@ -1,4 +1,4 @@
-"""Tasks that are not installed: a folder with a YAML file, or a configuration in a Python file or package."""
+"""Lookup of tasks that are not installed: a folder with a YAML file, or a configuration in a Python file or package."""
 
 import ast
 import os
@@ -107,7 +107,10 @@ def python_task(reference: str, name: str | None = None) -> TaskSource:
 
 
 def python_place(reference: str) -> tuple[Path, str]:
-    """Split a reference such as `FILE.py:NAME` into the real path of the file or folder, and NAME ('' if none)."""
+    """Split a reference such as `FILE.py:NAME` into the real path of the file or folder, and the name.
+
+    The name is empty if the reference has none.
+    """
     path, _, attribute = reference.rpartition(":")
     if not path or Path(reference).exists():
         return Path(reference).resolve(), ""

@@ -1,4 +1,4 @@
-"""Lookup of a robot's model file (MJCF) in the task's folder, another task's folder, a package, or a user's folder."""
+"""Lookup of a robot's model file (MJCF) in a task's folder, in an installed package, or in a folder of the user."""
 
 import contextlib
 import os

@@ -1,9 +1,12 @@
-"""Module names of tasks. A task's module has one name in `sys.modules` and may have another in the task's own files."""
+"""Names of task modules for messages: a module may have another name in `sys.modules` than in the task's own files.
+
+Several task folders may have a `task.py`; each is imported under a unique name.
+"""
 
 import re
 
 IMPORTED_NAME = "rlcli_folder_"
-"""Start of the module names under which folders and files are imported whose own name is taken."""
+"""Prefix of the module names of imported task folders and files whose own name is already in use."""
 OWN_NAMES: dict[str, str] = {}
 """Module name of an imported package or folder -> name under which its own files import it."""
 

@@ -1,4 +1,4 @@
-"""Import of plugins, protected against what their code prints, raises or changes."""
+"""Safe import of plugins: errors name the plugin, output goes to stderr, and changed settings are restored."""
 
 import builtins
 import contextlib
@@ -179,7 +179,7 @@ def _restore_built_in(before: dict[str, Any], is_callable: Callable[[object], bo
 _TorchSettings = tuple[str, str, bool]
 """torch's default dtype, its default device, and whether it records gradients (its gradient mode)."""
 _TORCH_DEFAULTS: _TorchSettings = ("torch.float32", "cpu", True)
-"""The settings of torch after its import."""
+"""Values that these settings of torch have after its import."""
 
 
 def _torch_settings() -> _TorchSettings | None:

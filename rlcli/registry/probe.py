@@ -1,4 +1,4 @@
-"""Details of tasks for `list-tasks`, read from a cache; `probe` loads tasks in other processes and fills the cache.
+"""Details of tasks for `rlcli list-tasks`: read from a cache, or found out by loading tasks in other processes.
 
 A distribution may ship the details as `index.json` in its top-level package, as the built-in tasks do. The details of
 other tasks are in the user's cache folder, under the distribution's name and version, and the time of its last change.
@@ -29,9 +29,9 @@ from rlcli.registry import OWN, TASKS, Entry, package_folder
 
 TIMEOUT_S = 30.0
 _IDLE_S = 3.0
-"""Time without a newly loaded plugin after which a process no longer counts as using a core [s]."""
+"""Time in which a process has loaded no further plugin, after which it counts as hanging and frees its core [s]."""
 _MAX_TIMEOUTS = 2
-"""Number of entry points of a distribution that may exceed the time limit before the others are skipped."""
+"""Number of entry points of one distribution that may exceed the time limit; then its other ones are skipped."""
 _MAX_PROCESSES = 64
 _SUFFIXES = (".py", ".yaml", ".xml")
 _BUILDER = "rlcli.envs.describe_plugins"

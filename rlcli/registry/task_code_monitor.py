@@ -1,4 +1,4 @@
-"""Reports about the code of tasks and plugins while a command runs: its errors, its warnings, and calls that hang."""
+"""Monitor of the code of tasks and plugins while a command runs; it reports errors, warnings and calls that hang."""
 
 import builtins
 import contextlib
@@ -32,10 +32,10 @@ SLOW_S = 10.0
 _SAMPLE_S = 1.0
 """Time between two looks at the running code [s]."""
 _MOST_TEXT = 200
-"""Longest text of a warning [characters]."""
+"""Largest length of a reported warning [characters]; longer ones are cut."""
 _BUILT_IN = vars(builtins)
 _ENTRIES = ("rlcli.cli.app", "rlcli.envs.sharding.worker")
-"""Modules that start a command or a worker: the frames that called them belong to the program that uses rlcli."""
+"""Modules that start a command or a worker. Frames outside of them belong to the program that called rlcli."""
 
 
 def error_of_task(error: BaseException) -> TaskError | None:
@@ -326,7 +326,7 @@ class _Watch(threading.Thread):
 
     def run(self) -> None:
         """Look at the running code until `end` is called."""
-        since: dict[FrameType, float] = {}  # the keys keep the frames, so that no new one has the same identity
+        since: dict[FrameType, float] = {}  # the keys keep the frames alive: a new one cannot get the same identity
         while not self._ended.wait(_SAMPLE_S):
             frames = frames_of_thread(self._watched)
             now = self._clock.now()

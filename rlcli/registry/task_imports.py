@@ -28,10 +28,10 @@ ENVIRONMENT = "entry_point"
 """Key under which `registrations` has the environment class of a task."""
 
 registrations: dict[str, dict[str, Any]] = {}
-"""ID -> arguments of every task that imported files have registered with Gymnasium."""
+"""Tasks that imported files have registered with Gymnasium: ID of the task -> arguments of the registration."""
 
 _imported: dict[tuple[Path, str], None] = {}
-"""Keys: the imported task files, in order, each with the name of the function that imported it."""
+"""Ordered set of the imported task files: (file, name of the function that imported it) -> None."""
 
 
 def load_object(reference: str) -> Any:

@@ -1,7 +1,7 @@
-"""Contract checks and linter for tasks: both run the task.
+"""Checks and linter for authors of tasks; both run the task.
 
-The checks test the contract that every task must keep. The linter looks for defects that make learning hard. Both are
-for authors of tasks; `rlcli check`, `rlcli lint` and the pytest plugin use them.
+The checks test the rules that every task must keep (its contract), for shapes, seeds, resets and others. The linter
+looks for properties that make learning hard. `rlcli check`, `rlcli lint` and the pytest plugin use them.
 
 ```python
 from rlcli.testing import check_task

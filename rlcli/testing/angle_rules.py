@@ -17,7 +17,7 @@ _LARGEST_ANGLES = {
     **{("events", "position"): _TURN, ("actions", "offset"): _TURN, ("scene", "joint_pos"): _TURN},
     **{("terminations", "bounds"): _TURN, ("rewards", "target"): _TURN, ("success", "target"): _TURN},
 }
-"""(section, key) -> largest sensible angle [rad]; above it the angle may be in degrees. A tilt is at most pi.
+"""(section, key) of a parameter -> largest sensible angle [rad]; a larger one may be in degrees. A tilt is at most pi.
 
 Joint positions are among them, so that a slide by more than 6.28 m is reported, too."""
 

@@ -26,14 +26,14 @@ from rlcli.testing.steps import (
 from rlcli.testing.task_under_test import TaskUnderTest, column_names, engine_state, expire_episodes, task_of
 
 _ENDING = [1, 4, 5]
-"""Environments whose episodes are ended while the episodes of the others continue."""
+"""Indices of the environments whose episodes a check ends, while the episodes of the others continue."""
 _LIMITS = (6, 9)
-"""Two episode lengths [steps]; an end that occurs at both follows the limit."""
+"""Two episode lengths [steps] that a check sets as time limit; episodes that end exactly then depend on the limit."""
 
 Trajectory = list[dict[str, Tensor]]
 """Outputs of each step: name, such as `reward` -> tensor with one row for each environment."""
 MakeFinding = Callable[[str, str, str], Finding]
-"""Type of `error_at` and `warning_at`: (where, message, hint) -> finding."""
+"""Type of the functions `error_at` and `warning_at`, which make a finding from (where, message, hint)."""
 
 
 def same_seed(subject: TaskUnderTest) -> Iterator[Finding]:
@@ -300,7 +300,7 @@ def _observe_twice(pair: _EnvPair) -> dict[str, tuple[Tensor, Tensor]]:
     if isinstance(env, ManagedEnv):
         obs = {group: values.clone() for group, values in result.obs.items()}
         running = ~(result.terminated | result.truncated)
-        env.observation_manager.load_state_dict(memory)  # histories and filters as before the first computation
+        env.observation_manager.load_state_dict(memory)  # restore histories and filters
         again = env.observation_manager.compute()
         return {f"observations.{group}": (values[running], again[group][running]) for group, values in obs.items()}
     task = task_of(env)

@@ -31,9 +31,9 @@ class Finding:
 
 
 error_at = partial(Finding, "", "error")
-"""(where, message, hint) -> error of the running check; `rlcli.testing.checks` adds the name of the check."""
+"""Function (where, message, hint) -> finding of severity error; `rlcli.testing.checks` adds the check's name."""
 warning_at = partial(Finding, "", "warning")
-"""(where, message, hint) -> warning of the running check; `rlcli.testing.checks` adds the name of the check."""
+"""Function (where, message, hint) -> finding of severity warning; `rlcli.testing.checks` adds the check's name."""
 
 
 class NotRunError(Exception):

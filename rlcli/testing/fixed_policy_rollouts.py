@@ -18,7 +18,7 @@ from rlcli.testing.steps import EndedEpisode, ended_episodes
 from rlcli.testing.task_under_test import TaskUnderTest, element_names
 
 MAX_STEPS = 1000
-"""Longest rollout if no duration is given [steps]."""
+"""Largest length of a rollout if the user sets no duration [steps]."""
 FixedPolicy = Callable[[int], Tensor]
 """Function from the index of a step to the actions of all environments. (num_envs, a)"""
 
@@ -41,7 +41,7 @@ def uniform(env: VecEnv, bound: float) -> FixedPolicy:
 
 
 def bang_bang(env: VecEnv, bound: float) -> FixedPolicy:
-    """Return a policy whose columns are at the bound and change sign at random times."""
+    """Return a policy whose actions are always +bound or -bound; each column changes its sign at random times."""
     generator = torch.Generator().manual_seed(env.seed + 1)
     shape = (env.num_envs, env.layout.action_size)
     sign = torch.where(torch.rand(shape, generator=generator) < 0.5, -1.0, 1.0)
@@ -55,7 +55,7 @@ def bang_bang(env: VecEnv, bound: float) -> FixedPolicy:
 
 
 def sine(env: VecEnv, bound: float) -> FixedPolicy:
-    """Return a policy of sines as high as the bound, each column with its own frequency and phase."""
+    """Return a policy of sine waves with the bound as amplitude; each column has its own frequency and phase."""
     generator = torch.Generator().manual_seed(env.seed + 2)
     frequency, phase = torch.rand(2, env.num_envs, env.layout.action_size, generator=generator).unbind(0)
     low, high = SINE_HZ

@@ -1,4 +1,4 @@
-"""Detection of host syncs: operations whose result the host must read before it continues."""
+"""Detection of host syncs: operations of torch for which the CPU (host) must wait until a GPU has computed a value."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 SYNC_OPS = {"_local_scalar_dense", "nonzero", "is_nonzero", "equal", "masked_select", "item", "unique", "_unique2"}
-"""Operations whose result the host must read before it continues."""
+"""Names of torch operations that return a value to the CPU, so that the CPU has to wait for a GPU."""
 COPY_OPS = {"lift_fresh", "lift", "from_file"}
-"""Operations that make a tensor from data of the host; a CUDA graph cannot record them."""
+"""Names of torch operations that make a tensor from data of the CPU; a CUDA graph cannot record them."""
 _MASKED = ("index", "index_put", "index_put_")
 
 

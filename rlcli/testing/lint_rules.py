@@ -39,7 +39,7 @@ def stops(evidence: RolloutEvidence) -> Iterator[Remark]:
 
 
 EARLY = 5
-"""Episodes of at most so many steps end early."""
+"""Number of steps up to which the end of an episode counts as early."""
 
 
 def early_resets(evidence: RolloutEvidence) -> Iterator[Remark]:
@@ -82,7 +82,7 @@ def silent_reward(evidence: RolloutEvidence) -> Iterator[Remark]:
 
 
 DOMINANT = 0.99
-"""Share of the sum of all terms' absolute values from which a term is dominant."""
+"""Fraction of the sum of all terms' absolute values above which a reward term counts as dominant."""
 
 
 def dominant_reward(evidence: RolloutEvidence) -> Iterator[Remark]:
@@ -231,7 +231,7 @@ def _columns(evidence: RolloutEvidence) -> Iterator[tuple[str, Tensor]]:
 
 
 SATURATED = 0.8
-"""Share of the steps at a limit from which a quantity is reported."""
+"""Fraction of the steps in which a quantity is at its limit, above which the rule reports the quantity."""
 
 
 def saturated_actions(evidence: RolloutEvidence) -> Iterator[Remark]:

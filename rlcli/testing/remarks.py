@@ -1,4 +1,4 @@
-"""Remarks of the lint rules."""
+"""Data class `Remark`, the finding of a lint rule, and functions that create remarks."""
 
 from __future__ import annotations
 
@@ -35,6 +35,6 @@ class Remark:
 
 
 error_at = partial(Remark, "", "error")
-"""(where, message, hint, numbers) -> error of the running rule; the linter adds the name of the rule."""
+"""Function (where, message, hint, numbers) -> remark of severity error; the linter adds the name of the rule."""
 warning_at = partial(Remark, "", "warning")
-"""(where, message, hint, numbers) -> warning of the running rule; the linter adds the name of the rule."""
+"""Function (where, message, hint, numbers) -> remark of severity warning; the linter adds the name of the rule."""

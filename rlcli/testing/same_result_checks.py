@@ -1,6 +1,8 @@
-"""Checks of `rlcli check`: equal results with other threads, numbers of environments and engines, and after a restore.
+"""Checks of `rlcli check` that compare two trajectories of a task, and checks of its files and its speed.
 
-Further checks: the shipped policy fits the task, the columns are as recorded, no Python loop runs over environments.
+The results must be equal with other numbers of threads and of environments, on the GPU engine, and after a restore from
+a checkpoint. Further checks: the shipped policy fits the task, observation and action columns are as recorded in the
+task's file, and no Python loop runs over environments.
 """
 
 from __future__ import annotations
@@ -93,7 +95,7 @@ def checkpoint(subject: TaskUnderTest) -> Iterator[Finding]:
     actions = list(random_actions(env, subject.bound, 7 + STEPS))
     other.reset(seed=subject.seed + 1)
     for action in actions[-3:]:
-        other.step(action.clone())  # so that its state differs before it is restored
+        other.step(action.clone())  # one step, so that the state differs from the saved one before it is restored
     env.reset(seed=env.seed)
     for action in actions[:7]:
         result = env.step(action.clone())

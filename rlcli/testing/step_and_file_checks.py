@@ -1,4 +1,4 @@
-"""Checks of `rlcli check`: names in models, YAML round trip, results of steps.
+"""Checks of `rlcli check` about a task's files (names in models, YAML) and about the results of its steps.
 
 Each function tests one rule that a task must keep.
 """

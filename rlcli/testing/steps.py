@@ -1,4 +1,4 @@
-"""Steps of an environment for the checks: actions, recorded trajectories and ended episodes."""
+"""Helpers of the checks that step an environment: test actions, recorded trajectories, ended episodes."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ class Recording:
 
     env: VecEnv
     steps: list[StepResult] = field(default_factory=list)
-    """The results themselves, not copies: the task may have changed their tensors since."""
+    """The step results themselves, not copies: the task may have changed their tensors in later steps."""
     obs: list[dict[str, Tensor]] = field(default_factory=list)
-    """Copies, beginning with the observations of the reset. [group -> (num_envs, d)]"""
+    """Copies of the observations, those of the reset first: for each step, group -> (num_envs, d)."""
     late_writes: dict[str, int] = field(default_factory=dict)
     """Name of an output that was changed in place during a later step -> index of the first such step."""
     shared: dict[str, int] = field(default_factory=dict)

@@ -1,4 +1,4 @@
-"""Task under test: small seeded environments, and one recording that several checks share."""
+"""Class `TaskUnderTest`: a task with small seeded environments, and one recording that several checks share."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class TaskUnderTest:
         resolve(source, agent=agent, config_file=config, overrides=overrides, play=True)
         self.resolved = self._resolve({})
         self.notes: dict[str, str] = {}
-        """Check -> further text that is printed with its result."""
+        """Name of a check -> text that is printed with its result, such as a measured speed."""
         self._recording: Recording | None = None
 
     @property

@@ -13,7 +13,7 @@ from rlcli.envs.vec_env import VecEnv
 PASSIVE_S = 1.0
 """Simulated time without actuators [s]."""
 MAX_STEPS = 1000
-"""Largest number of physics steps of the measurement."""
+"""Largest number of physics steps that the measurement takes."""
 
 
 @dataclass(frozen=True, slots=True)

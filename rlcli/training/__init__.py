@@ -1,1 +1,1 @@
-"""One training, from a configuration or a saved run to the last checkpoint."""
+"""Modules that run a training: setup, loop, checkpoints, evaluations, health checks, metric loggers and signals."""

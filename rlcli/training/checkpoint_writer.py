@@ -36,7 +36,7 @@ _DEFAULT_LAST = 10
 """Number of newest checkpoints to keep by default if checkpoints are saved by time, without a `save_interval`."""
 
 _NewRows = list[tuple[int, int, dict[str, Tensor]]]
-"""Rows of a log, such as a replay buffer, that are in no file yet: (start, stop, columns) for each new file."""
+"""Rows of a log (data such as a replay buffer) that must be written: (start, stop, columns) for each new file."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +81,7 @@ class CheckpointWriter:
         self.best: int | None = None
         """Environment steps of the checkpoint with the best evaluation; None: no evaluation yet."""
         self.newest: tuple[int, int] | None = None if resumed is None else (resumed.iteration, resumed.step)
-        """Iteration and environment steps of the newest checkpoint, which may not be completely written yet."""
+        """Iteration and environment steps of the newest checkpoint; the background thread may still be writing it."""
         self.written = self.newest
         """Iteration and environment steps of the newest checkpoint on the disk."""
         self._keep, self._manifest = keep, dict(manifest)
@@ -108,7 +108,7 @@ class CheckpointWriter:
         self._thread.start()
 
     def save_cases(self, iteration: int, step: int) -> None:
-        """Write the recorded failed episodes of an iteration that ended with an error, so without a checkpoint."""
+        """Write the recorded failed episodes of an iteration that ended with an error, and so has no checkpoint."""
         if self.cases is not None:
             self.cases.commit(iteration, step)
             batch = self.cases.take(step)
@@ -255,7 +255,7 @@ def prune(checkpoints: Path, keep: KeepRule, best: int | None) -> None:
         return
     for step in saved[1 : -keep.last]:
         folder = checkpoints / f"{step:012d}"
-        with contextlib.suppress(OSError, CheckpointError):  # what cannot be read is kept
+        with contextlib.suppress(OSError, CheckpointError):  # a checkpoint that cannot be read is kept
             iteration = open_checkpoint(folder).iteration
             if step != best and not (keep.every and iteration % keep.every == 0):
                 _remove(folder)
@@ -280,7 +280,7 @@ def drop_after(checkpoints: Path, step: int) -> list[int]:
         else:
             _remove(folder)
             removed.append(saved)
-    # also without a later checkpoint, because a run may be killed before it wrote the file
+    # also if no checkpoint was removed: a killed run may not have written this file
     write_atomic(checkpoints / "latest", f"{step:012d}\n")
     drop_rows(checkpoints, aside)
     return removed[::-1]

@@ -17,7 +17,7 @@ from rlcli.rl.trainer_base import BaseTrainer
 
 RETURN, LENGTH, SUCCESS = "Train/mean_reward", "Train/mean_episode_length", "Train/success_rate"
 _GROUPS = ("Train/", "Eval/success", "Loss/", "Policy/", "Episode_", "Success", "Health/")
-"""Prefixes of the metrics that the checks read."""
+"""First parts of the names of the metrics that the checks read."""
 _TIMES = 40
 """Number of times in a training at which the checks run."""
 _MIN_ITERATIONS = 8
@@ -130,7 +130,10 @@ class Health:
         return values[-max(3, len(values) // 8) :]
 
     def change(self, name: str) -> float:
-        """Return a metric's change since the beginning, divided by its noise (at least 10 % of its first value)."""
+        """Return a metric's change since the start of the training, in units of its noise.
+
+        The noise is the spread of its values, but at least 10 % of the first value.
+        """
         before, after = self.first(name), self.last(name)
         if not before:
             return 0.0
@@ -407,7 +410,7 @@ def falling_success(health: Health) -> Found:
 
 
 def _gaps(values: list[float], bounds: Mapping[str, Any]) -> list[float]:
-    """Return minus the distance of each value to the range `at_least` to `at_most`; 0 within the range."""
+    """Return, for each value, the negative distance to the range from `at_least` to `at_most`; 0 within the range."""
     low, high = bounds.get("at_least"), bounds.get("at_most")
     return [-max((low if low is not None else v) - v, v - (high if high is not None else v), 0.0) for v in values]
 

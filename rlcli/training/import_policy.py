@@ -29,7 +29,7 @@ from rlcli.runs.untrusted_weights import VEC_NORMALIZE_HINT, read_archive_file, 
 from rlcli.training.checkpoint_writer import manifest_entries, write_checkpoint
 
 _NORMALIZER_EPS = 1e-2
-"""Number that RSL-RL adds to the standard deviation of observations."""
+"""Number that RSL-RL adds to the standard deviation of observations before it divides by it."""
 _MIN_STD = 1e-6
 """Smallest standard deviation of actions."""
 
@@ -278,7 +278,10 @@ def _log_std(weights: Mapping[str, Tensor], names: Mapping[str, str], file: Path
 
 
 def _lstm(weights: Mapping[str, Tensor], prefix: str, file: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Return (entries of `policy.json`, weights) of the LSTM whose names begin with `prefix`; empty without one."""
+    """Return (entries of `policy.json`, weights) of the LSTM in a file; both are empty if it has no LSTM.
+
+    The names of the LSTM's weights begin with `prefix`.
+    """
     lstm: dict[str, Tensor] = {}
     for name, value in below(weights, prefix).items():
         kind, _, layer = name.rpartition("_l")

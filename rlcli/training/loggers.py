@@ -111,7 +111,7 @@ class TensorBoard:
             self._file.flush()
         except OSError:
             with contextlib.suppress(OSError):
-                self._file.close()  # the training drops a logger that has failed
+                self._file.close()  # the training goes on without a logger that has failed
             raise
 
 

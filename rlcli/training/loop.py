@@ -36,7 +36,7 @@ LONG_S = 0.1
 RECENT = 100
 """Number of iterations whose mean duration gives the time left."""
 DIVERGED_SHARE = 0.01
-"""Share of an iteration's environment steps that may diverge before the run stops."""
+"""Fraction of an iteration's environment steps that may diverge; above it the training stops."""
 
 
 @dataclass(slots=True)

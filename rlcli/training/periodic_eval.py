@@ -1,4 +1,4 @@
-"""Evaluation between iterations, which finds the best checkpoint."""
+"""Evaluation of the policy every few iterations of a training; its best score marks the best checkpoint."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class PeriodicEval:
         self._make_env, self._episodes, self._interval = make_env, episodes, interval
         self._env: Environment | None = None
         self._initial_state: Mapping[str, Tensor] = {}
-        best = max(history, key=_score, default={})  # the first one of several with the same score
+        best = max(history, key=_score, default={})  # if several iterations have the best score, the first one counts
         self._best = _score(best)
         self.best: int | None = best["step"] if self._best > _score({}) else None
         """Environment steps of the best iteration in the history; None: it has no evaluation."""

@@ -1,4 +1,7 @@
-"""Progress of a training, for display by `train`, `watch` and others. The module imports neither torch nor MuJoCo."""
+"""Data class with the progress of a training (iteration, speed, time left), for display by `train` and `watch`.
+
+The module imports neither torch nor MuJoCo.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,7 @@ from typing import Any
 PARTS = ("physics", "task", "policy", "update")
 """Parts of an iteration whose durations are measured."""
 _FOREVER_S = 1e10
-"""Longest remaining time that is displayed [s]."""
+"""Largest remaining time that is displayed [s]; a longer one counts as unknown."""
 
 
 @dataclass(slots=True)

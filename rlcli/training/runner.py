@@ -251,7 +251,7 @@ def _health(job: Job, iterations: int) -> Health | None:
 
 
 def _report_bar(run: Run, bar: str, reached: bool) -> None:
-    """Log and record the time and the steps in which the training reached `bar`, the threshold of `--until`."""
+    """Log and record the training time and steps until an evaluation reached `bar`, the threshold of `--until`."""
     rows = read_metrics(run.metrics)
     seconds, step = sum(map(training_s, rows)), rows[-1]["step"] if rows else 0
     run.update(until={"bar": bar, "reached": reached, "seconds": seconds, "step": step})

@@ -401,7 +401,10 @@ def _require_larger_budget(request: TrainingRequest, run: Run, folder: Path | No
 
 
 def _overrides_in(given: object) -> Any:
-    """Return the items of run.json's entry `given` (key -> origin of its value) whose values come from overrides."""
+    """Return the items of `given` whose values come from overrides of the command line.
+
+    `given` is an entry of run.json: key of a setting -> origin of its value.
+    """
     if not isinstance(given, dict):
         return given
     return {key: origin for key, origin in given.items() if str(origin).startswith("override")}

@@ -1,4 +1,4 @@
-"""Option `--until KEY=X`: the threshold that ends a training, and the time that a training took to reach it."""
+"""Threshold of the option `--until KEY=X`, which ends a training, and measurement of the time to reach it."""
 
 from __future__ import annotations
 
@@ -80,6 +80,9 @@ def time_to_threshold(rows: Iterable[Mapping[str, Any]], threshold: Threshold) -
 
 
 def median(values: Sequence[float | None]) -> float | None:
-    """Return the median of times to the threshold over seeds; None, as a value or result: it was not reached."""
+    """Return the median, over seeds, of the times to the threshold.
+
+    A value is None if that training did not reach the threshold; the result is None if half of them did not.
+    """
     found = statistics.median([math.inf if value is None else value for value in values])
     return found if math.isfinite(found) else None

@@ -33,9 +33,9 @@ from rlcli.runs.safe_io import FileModel
 _log = logging.getLogger(__name__)
 
 _MAX_ROWS = 100_000
-"""Longest queue of iterations; a tracker with a longer queue has failed."""
+"""Largest number of iterations that may wait for a tracker; with more, the tracker counts as failed."""
 _TIMEOUT_S = 60.0
-"""Longest time that the end of a training waits for a tracker [s]."""
+"""Time after which the end of a training no longer waits for a tracker [s]."""
 
 
 class Logger(Protocol):
@@ -271,7 +271,7 @@ class Trackio(_LibraryRun):
             GRADIO_ANALYTICS_ENABLED="False",
         )
         if not any(os.environ.get(name) for name in ("TRACKIO_SPACE_ID", "TRACKIO_SERVER_URL")):
-            _set_default_variables(HF_HUB_OFFLINE="1")  # else it asks the Hugging Face hub for the owner of the key
+            _set_default_variables(HF_HUB_OFFLINE="1")  # otherwise trackio asks the Hugging Face hub who owns the key
         trackio = importlib.import_module("trackio")
         self.id = resume_id or run.folder.name
         self._run = trackio.init(

@@ -1,4 +1,7 @@
-"""Trainings in subprocesses, for sweeps and several seeds: `rlcli train` commands that are stopped together."""
+"""Start and control of `rlcli train` commands in subprocesses, for sweeps and for several seeds.
+
+A signal that stops this process also stops all of these trainings.
+"""
 
 from __future__ import annotations
 
