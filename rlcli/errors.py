@@ -1,4 +1,4 @@
-"""Errors that the user can fix. The command line ends with the exit code of the class.
+"""Exception classes for errors that the user can fix; the command line ends with the exit code of the class.
 
 Any other exception is a bug and keeps its traceback.
 """
@@ -177,7 +177,7 @@ def pip_install(package: str) -> str:
 
 
 _MAX_ERROR_TEXT = 20_000
-"""Longest message of an error that is read [characters]: longer ones take too much time to split and to escape."""
+"""Largest part of an error's message that is read [characters]: more would take too long to split and escape."""
 
 
 def error_text(error: BaseException) -> str:

@@ -21,7 +21,7 @@ _MIX2 = np.array(0x94D049BB133111EB, np.uint64)
 _S30, _S27, _S31, _S40 = (np.array(shift, np.uint64) for shift in (30, 27, 31, 40))
 _TO_UNIT = np.array(2.0**-24, np.float32)
 _NARROW = 8
-"""Number of words of a key up to which numpy adds faster along the keys than along the words."""
+"""Number of random words per key up to which numpy adds faster along the keys than along the words."""
 _BLOCK = 1 << 14
 """Number of 64-bit values that are hashed at once, so that their copies stay in the cache of a core."""
 

@@ -26,7 +26,7 @@ def shorten(value: object, limit: int, mark: str = "...") -> str:
 _LONG = re.compile(r"""\S{201,}|(?<!\w)'[^']{199,}'|"[^"]{199,}\"""")
 """A word or a quoted text of over 200 characters."""
 _MAX_ECHO, _MAX_LINE = 200, 2000
-"""Longest part of an input that a message repeats, and longest line of a message [characters]."""
+"""Largest part of an input that a message repeats, and largest length of a line of a message [characters]."""
 _inputs: deque[str] = deque(maxlen=1000)
 """Words of the command line and texts of files that are longer than `_MAX_ECHO` when they are printed."""
 _input_pieces: set[int] = set()
@@ -65,7 +65,7 @@ def message_line(text: str) -> str:
 
 
 def _without_echoes(line: str) -> str:
-    """Return a line with every copy of more than `_MAX_ECHO` consecutive characters of an input shortened."""
+    """Return a line in which each copy of more than `_MAX_ECHO` consecutive characters of an input is shortened."""
     size = _MAX_ECHO + 1
     if len(line) < size or not _inputs:
         return line

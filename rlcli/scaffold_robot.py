@@ -112,7 +112,7 @@ def read_robot(file: Path, name: str, kind: str | None = None) -> RobotTask:
             "ppo": _fill("agent", _AGENT_VALUES[kind]),
         },
     }
-    task = json.loads(json.dumps(task))  # without shared lists, which YAML would write as anchors
+    task = json.loads(json.dumps(task))  # copies: YAML would write lists that are used twice as anchors
     return RobotTask(kind, reason, robot.xml, robot.assets, task, robot.found, robot.has_pose, robot.doubts)
 
 

@@ -1,4 +1,4 @@
-"""The user's settings of the command line. They hold for all folders and tasks and are never a part of a task.
+"""Access to the user's settings of the command line, which hold for all folders and are never part of a task.
 
 The file `settings.yaml` is in the platform's folder for user configuration; `rlcli.config.user_settings` reads it.
 Precedence: flag, environment variable, settings file, default. Programs that import the library ignore the file.

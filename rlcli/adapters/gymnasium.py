@@ -27,7 +27,7 @@ from rlcli.viewer.offscreen import Renderer
 Floats = NDArray[np.float32]
 """Array of float32 numbers."""
 Changes = Mapping[str, Any] | Iterable[str] | TaskConfig | Resolved | None
-"""Changes of a task's configuration, or a whole one: see `cfg` of `open_task`."""
+"""Changes of a task's configuration, or a whole configuration: see the argument `cfg` of `open_task`."""
 
 
 def open_task(
@@ -103,7 +103,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.ended: NDArray[np.bool_] = np.zeros(self.num_envs, dtype=bool)
-        """Environments whose episode has ended and that wait for a reset; in the mode SAME_STEP none. (num_envs,)"""
+        """Whether the episode has ended and waits for a reset; always false in the mode SAME_STEP. (num_envs,) bool"""
         # The `VecEnv` resets an ended environment within the step. The first observation of the new episode is kept
         # here until Gymnasium's mode allows it to be returned.
         self._first: Floats | None = None

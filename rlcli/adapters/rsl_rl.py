@@ -1,4 +1,4 @@
-"""Adapter of a `VecEnv` to RSL-RL's interface, for the runners of RSL-RL."""
+"""Adapter that gives a `VecEnv` the interface of RSL-RL's environments, so that RSL-RL's runners can train in it."""
 
 from typing import Any
 

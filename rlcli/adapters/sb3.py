@@ -1,4 +1,4 @@
-"""Environments of a task for scripts that train with Stable-Baselines3 themselves, without `rlcli train`."""
+"""Function `make_sb3`: environments of a task for scripts that call Stable-Baselines3 without `rlcli train`."""
 
 from typing import Any
 

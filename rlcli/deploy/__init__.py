@@ -1,1 +1,1 @@
-"""Export of trained policies to files that run without rlcli, with metadata, and their check in plain MuJoCo."""
+"""Export of trained policies to files that run without rlcli, and a check that these files work in plain MuJoCo."""

@@ -48,7 +48,7 @@ _log = logging.getLogger(__name__)
 CLOSE = 1e-4
 """Largest accepted difference of an observation or a control, relative to max(1, |value|)."""
 ROUNDING = 1e-3
-"""Largest difference of actions and of states after one step that counts as rounding."""
+"""Largest difference of actions, and of states after one step, that counts as a rounding error."""
 RETURN = 0.02
 """Largest accepted difference of the mean return, relative to the evaluation's mean |return|."""
 _SEED = 42
@@ -86,7 +86,7 @@ class ClosedLoopResult:
     plain_return: float
     """Mean return in plain MuJoCo."""
     scale: float
-    """Mean |return| of the evaluation, by which differences of returns are divided."""
+    """Mean absolute return of the evaluation's episodes, by which differences of returns are divided."""
     by_metadata: list[str]
     """Terms that the generated program computed from formulas in the metadata."""
     by_task: list[str]
@@ -155,7 +155,7 @@ def open_reference(choice: Choice, checkpoint: Checkpoint, named: TaskSource | N
     configure = partial(resolve, choice.source(named), agent=choice.agent, play=True)
     resolved = configure()
     groups = resolved.task.observations.items()
-    # corruption is random, so an exported file cannot reproduce it
+    # noise and bias of observations are random, so an exported file cannot reproduce them
     clean = [f"observations.{name}.enable_corruption=false" for name, group in groups if group.enable_corruption]
     clean += [f"actions.{name}.delay=null" for name, term in resolved.task.actions.items() if term and term.delay]
     if clean:
@@ -277,7 +277,7 @@ class _PlainMujocoRunner:
         self._open_terms = [term for term in self._plan["observations"] if not term["closed"]]
         self._decimation = controller.metadata["decimation"]
         self._forces: set[str] = set()
-        """Fields of forces that the task's code has set in its steps."""
+        """Names of the MjData fields of forces that the task's own code has set in its steps."""
 
     def act(self, obs: Tensor) -> Tensor:
         """Return the actions of the exported policy for the states of plain MuJoCo. (num_envs, a)

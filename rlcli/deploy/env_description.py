@@ -215,7 +215,8 @@ def _joints(env: VecEnv) -> list[dict[str, Any]]:
             for column, actuator in entity.actuators_of(kind):
                 # MuJoCo's position actuator: force = kp (ctrl - q) - kv q', with gainprm[0] = kp and biasprm[2] = -kv
                 stiffness = float(model.actuator_gainprm[actuator, 0]) if kind == "position" else 0.0
-                damping = 0.0 - float(model.actuator_biasprm[actuator, 2]) if kind != "motor" else 0.0  # never -0.0
+                # 0.0 - x, because -x would be -0.0 for x = 0
+                damping = 0.0 - float(model.actuator_biasprm[actuator, 2]) if kind != "motor" else 0.0
                 gains[column] = stiffness, damping
         for actuator_model in entity.actuators:
             for i, column in enumerate(actuator_model.joints):

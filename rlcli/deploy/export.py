@@ -29,13 +29,13 @@ from rlcli.runs.layout_and_deployment import deployment_of, layout_of
 __all__ = ["BUNDLE", "FORMATS", "TOLERANCE", "Exported", "check_target", "export", "require_self_contained"]
 
 BUNDLE = "bundle"
-"""Format that is a folder which rlcli itself reads: `rlcli.runs.policy_bundle`."""
+"""Name of the format for a folder that rlcli itself reads, see `rlcli.runs.policy_bundle`."""
 TOLERANCE = 1e-5
 """Largest accepted difference from the policy, relative to max(1, |value|)."""
 _RANDOM = 256
-"""Number of random observations on which a file is checked."""
+"""Number of random observations with which an exported file is checked against the policy."""
 _EPISODE = 32
-"""Steps between resets of the hidden state while a file is checked."""
+"""Number of steps between resets of a recurrent policy's hidden state while an exported file is checked."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +135,7 @@ def relative_difference(found: Tensor, expected: Tensor) -> Tensor:
 def _observations(checkpoint: Checkpoint, size: int) -> Tensor:
     """Return test observations: those recorded in training (if any), random ones, and both times 1000. (n, size)"""
     random = torch.randn(_RANDOM, size, generator=torch.Generator().manual_seed(0))
-    has_trainer = "trainer.safetensors" in checkpoint.manifest["files"]  # a bundle has none
+    has_trainer = "trainer.safetensors" in checkpoint.manifest["files"]  # a bundle has no recorded observations
     recorded = checkpoint.tensors("trainer").get("observations") if has_trainer else None
     if recorded is not None and recorded.shape[1:] == (size,) and bool(recorded.isfinite().all()):
         random = torch.cat([recorded.float(), random])

@@ -23,7 +23,7 @@ FORMATS = {"onnx": ".onnx", "torch": ".pt2", "numpy": ".py"}
 """Format -> suffix of its files."""
 _OPSET = 18
 _ONNX_ADDRESS_SPACE = 3 << 29
-"""Limit of a process [bytes] below which onnxruntime ends it without a message."""
+"""Memory limit of a process (`ulimit -v`) [bytes] below which onnxruntime ends the process without a message."""
 
 PolicyFunction = Callable[[dict[str, Tensor]], dict[str, Tensor]]
 """Exported policy as a function: inputs by name -> outputs by name."""
@@ -96,7 +96,7 @@ def _onnx_bytes(graph: DeployedPolicy, properties: dict[str, str]) -> bytes:
         )
     assert program is not None
     for node in program.model.graph:
-        node.metadata_props.clear()  # they hold stack traces with paths of this machine
+        node.metadata_props.clear()  # these entries hold stack traces with paths of this machine
     program.model.producer_name = "rlcli"
     program.model.metadata_props.update(properties)
     model = program.model_proto

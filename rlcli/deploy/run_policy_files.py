@@ -1,4 +1,4 @@
-"""Files that `export --verify` writes beside a policy: the MuJoCo model, and a program that runs the policy on it."""
+"""Writer of the files beside a policy exported with --verify: the MuJoCo model, and a program that runs the policy."""
 
 import contextlib
 import ctypes

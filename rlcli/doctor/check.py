@@ -1,4 +1,4 @@
-"""Result of one check of `rlcli doctor`."""
+"""Data class `Check`: the result of one check of `rlcli doctor`."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -15,4 +15,4 @@ class Check:
     found: str
     hint: str | None = None
     details: dict[str, Any] = field(default_factory=dict)
-    """Figures behind `found`, such as versions or bytes, as JSON data for `rlcli doctor --json`."""
+    """Exact values of what was found, such as versions or bytes, as JSON data for `rlcli doctor --json`."""

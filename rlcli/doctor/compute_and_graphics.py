@@ -1,4 +1,4 @@
-"""Checks that run in separate processes because they may hang or crash: torch and MuJoCo, OpenGL, GPU drivers."""
+"""Checks of torch, MuJoCo, OpenGL and GPU drivers; they run in separate processes because they may hang or crash."""
 
 import contextlib
 import json
@@ -156,7 +156,7 @@ def graphics_check(answers: dict[str, Answer]) -> Check:
 
 
 _KNOWN = ("enable", "enabled", "on", "true", "1", "glx", "wgl", "cgl")
-"""Values of MUJOCO_GL that MuJoCo accepts besides the names of the backends."""
+"""Further values that MuJoCo accepts in the environment variable MUJOCO_GL, besides the names of backends."""
 
 
 def run_isolated(check_name: str, timeout_s: float) -> Answer:

@@ -1,4 +1,4 @@
-"""Checks of the machine and of what the user has set: cores, memory, folders, text, settings, environment variables."""
+"""Checks of the machine (cores, memory, folders, text encoding), of the settings file and of environment variables."""
 
 import os
 import shutil
@@ -23,7 +23,7 @@ VARIABLES = (
 """Environment variables that `rlcli doctor` lists, if they are set."""
 LOW_DISK_BYTES = 1e9
 LOW_MEMORY_BYTES = 1e9
-"""Memory below which training gets a warning; torch and MuJoCo alone take about half of it."""
+"""Memory [bytes] below which the check warns about training; torch and MuJoCo alone take about half of it."""
 
 
 def machine_checks(runs_dir: Path) -> list[Check]:

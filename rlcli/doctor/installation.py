@@ -17,7 +17,7 @@ from rlcli.registry.probe import probe
 MUJOCO_PACKAGES = ("mujoco", "mujoco-core", "mujoco-studio")
 """The three PyPI packages of MuJoCo, which must have the same version."""
 _NO_EXTRAS = ("all", "dev", "docs")
-"""Extras that are not checked: lists of other extras, and the tools that develop rlcli."""
+"""Extras (optional dependencies) that are not checked: those that list other extras, and tools for developers."""
 _REQUIREMENT = re.compile(r"\s*([\w.-]+)(?:\[[^]]*\])?\s*([^;]*)(?:;(.*))?")
 _BOUND = re.compile(r"\s*(==|>=|<=|!=|<|>)\s*([\d.]+)(\.\*)?\s*")
 

@@ -1,4 +1,4 @@
-"""`python -m rlcli.doctor.isolated_checks CHECK`: run a check that may crash, and print its result as JSON."""
+"""Checks that may crash, run as `python -m rlcli.doctor.isolated_checks CHECK`; the result is printed as JSON."""
 
 import contextlib
 import ctypes

@@ -1,1 +1,1 @@
-"""Evaluation of policies: episodes and their statistics, limits, comparisons, stress tests, and a regulator (LQR)."""
+"""Evaluation of policies: statistics of episodes, limits, comparisons, stress tests, a reference controller (LQR)."""

@@ -27,7 +27,7 @@ _WITHOUT_EFFECT = (
     ("agents",),
     ("summary",),
 )
-"""Settings that may differ between the tasks: they do not affect episodes."""
+"""Settings in which the compared tasks may differ, because these settings do not affect episodes."""
 _MISSING = "not set"
 """Text for the value of a setting that a task does not have."""
 
@@ -40,7 +40,10 @@ class Comparison:
     policies: list[PolicyInTask]
     summaries: list[dict[str, Any]]
     pairs: list[dict[str, Any]]
-    """For each policy but the first: metric -> paired difference and probability of improvement of the first."""
+    """One entry for each policy but the first: metric -> statistics of the pair (first policy, this policy).
+
+    They are the mean of first - this over equal episodes, and the probability that the first is better.
+    """
     num_envs: int
 
     def record(self) -> dict[str, Any]:

@@ -21,7 +21,7 @@ _COLUMNS = (
     *("envs", "returns", "lengths", "truncated", "successes", "held", "condition_values"),
     *("reward_terms", "causes", "values"),
 )
-"""Fields of an evaluation with one value for each episode."""
+"""Names of the fields of `Evaluation` that have one value for each episode."""
 
 
 @dataclass(slots=True)

@@ -1,4 +1,4 @@
-"""Limits of an evaluation: `--fail-under success=0.99` and `--fail-over error_vel_xy=0.25`."""
+"""Limits for the metrics of an evaluation, such as `--fail-under success=0.99`; a missed limit fails the command."""
 
 from __future__ import annotations
 

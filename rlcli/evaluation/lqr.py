@@ -29,10 +29,10 @@ _MAX_RESIDUAL = 1e-2
 _MAX_DRIFT = 1e-5
 """Largest movement of an equilibrium in one step [m or rad, m/s or rad/s]."""
 _SINGULAR = 1e-4
-"""Singular values of the observations below this share of the largest are rounding errors."""
+"""Fraction of the largest singular value of the observations below which a singular value is a rounding error."""
 _MAX_ITERATIONS = 100_000
 _MAX_COST = 1e12
-"""Cost of a unit state above which the system cannot be stabilised."""
+"""Largest cost of a state of length 1; with a higher cost, no linear feedback stabilises the system."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +42,7 @@ class Regulator:
     gain: Matrix
     """Gain matrix K of the regulator. (actions, observations)"""
     rest: Matrix
-    """The observation of the equilibrium. (observations,)"""
+    """Observation in the equilibrium, at which the regulator's action is 0. (observations,)"""
     bound: float | None
     """Largest absolute action; None: no bound."""
     poles: tuple[float, ...]

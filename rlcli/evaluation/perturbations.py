@@ -217,7 +217,7 @@ class _Push:
 
 
 _STEPS = 1 << 32
-"""More steps than an episode has: step t of episode e has the counter e * _STEPS + t."""
+"""Upper bound of the steps of an episode; step t of episode e has the unique counter e * _STEPS + t."""
 
 
 def _keys(env: VecEnv, counters: Tensor) -> random.Keys:
@@ -324,7 +324,7 @@ class ModelPerturbation:
             ends = torch.tensor([-1.0, 1.0], dtype=now.dtype, device=now.device)
             return [value * ends.repeat(now.shape[1] // 2)]
         if self._sweep.parameter == "gravity":
-            return [now * (value / now.square().sum(dim=1, keepdim=True).sqrt())]  # keeps its direction
+            return [now * (value / now.square().sum(dim=1, keepdim=True).sqrt())]  # the direction stays the same
         if self._sweep.parameter == "body_mass":
             return [part.now() * (value / now).repeat_interleave(part.width, dim=1) for part in self._parts]
         return [value.expand_as(now)]

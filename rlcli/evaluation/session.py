@@ -1,4 +1,4 @@
-"""Preparation of the commands play, eval, stress and report: find a policy and its task, and build the environment."""
+"""Functions that find a policy and its task and build the environment, for `play`, `eval`, `stress` and `report`."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _log = logging.getLogger(__name__)
 
 POLICIES = ("trained", "zero", "random", "lqr")
 MAX_ENVS = 8192
-"""Largest number of environments that run at a time; more episodes run in batches."""
+"""Largest number of environments; for more episodes than this, each environment runs several, one after the other."""
 
 
 @dataclass(frozen=True, slots=True)

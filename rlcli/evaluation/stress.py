@@ -26,7 +26,7 @@ from rlcli.rl.rng import seed_generators
 _log = logging.getLogger(__name__)
 
 _NEAR = 0.25
-"""Standard deviation of the search near the worst variant, as a share of each parameter's range."""
+"""Standard deviation of the random points near the worst variant, as a fraction of each parameter's range."""
 
 Actor = Callable[[VecEnv], Act]
 """Function from an environment to a policy's action function in it (`session.make_actor`)."""

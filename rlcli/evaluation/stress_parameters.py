@@ -21,7 +21,7 @@ PHYSICAL = {
     "effort_limit": "actuator_forcerange",
     "gravity": "opt.gravity",
 }
-"""Parameter -> field of MjModel that it changes. Names of MjModel fields, such as `body_mass`, are also parameters."""
+"""Parameter with a name of its own -> field of MjModel that it changes; other MjModel fields are parameters, too."""
 SIGNALS = {
     "action_delay": "control steps",
     "action_noise": "standard deviation, in the units of the policy's actions",
@@ -29,7 +29,7 @@ SIGNALS = {
     "observation_noise": "standard deviation, in the units of the policy's observations",
     "push": "m/s or rad/s",
 }
-"""Parameter that does not change the model -> unit of its values."""
+"""Parameter that changes signals (observations, actions, pushes) and not the model -> unit of its values."""
 _INTEGER = ("action_delay", "observation_delay")
 _MAX_POINTS = 1000
 """Largest number of values of a sweep, and of steps of a delay."""

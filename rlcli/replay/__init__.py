@@ -1,1 +1,1 @@
-"""Recordings of evaluations, of failures in a training and of diverged simulations, and replays of them."""
+"""Files with recorded steps (of evaluations, of failures in a training, of diverged simulations), and their replay."""

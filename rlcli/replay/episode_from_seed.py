@@ -26,11 +26,11 @@ class EpisodeStart:
     obs: Tensor
     """Observations of the policy. (num_envs, d)"""
     episodes_before: int
-    """Episodes of the environment that were run before."""
+    """Number of earlier episodes of this environment that were run before."""
     reasons: list[str]
     """Reasons why episode K could not start at once; empty if it did."""
     generators: dict[str, Tensor]
-    """States of the generators that all environments share, before any step."""
+    """States of the global random generators, which all environments share, before any step."""
 
     def shared_draws(self) -> bool:
         """Return whether the task has drawn random numbers from global generators since the start.

@@ -24,9 +24,9 @@ from rlcli.runs.safe_io import read_errors, require_inside, require_plain_entrie
 
 _log = logging.getLogger(__name__)
 FOLDER = "autopsy"
-"""Folder of the files in a run."""
+"""Name of the folder in a run that has the files of failure cases."""
 FILE_NAME = re.compile(r"(\d{12,15})-env-(\d{6,12})-episode-(\d{6,15})\.safetensors")
-"""Pattern of file names. Its groups are the environment steps of the run, the environment and the episode."""
+"""Pattern of the name of a failure case's file: its groups are environment steps, environment and episode."""
 _MAX_FILES = 10_000
 
 
@@ -174,7 +174,7 @@ class StagedCase:
 
     staged: Staged
     states: list[NDArray[np.float64]]
-    """The finite states at the beginning of each kept step, and after the last one."""
+    """States at the beginning of each kept step and after the last one, without states that are not finite."""
 
     def forward(self, number: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
         """Return MuJoCo's model, and its data at the recorded state `number`, with all derived fields computed."""

@@ -53,7 +53,7 @@ FAR = 3.0
 """Distance from the quartiles, in interquartile ranges, above which a return is an outlier (Tukey's outer fences)."""
 _RETURNS_FILE = "recent.json"
 _MIN_SPREAD = 1e-3
-"""Smallest interquartile range, as a share of the quartiles: returns with three equal digits are no outliers."""
+"""Smallest interquartile range, as a fraction of the quartiles: returns equal in three digits are no outliers."""
 
 _Key = tuple[FailureKind, *tuple[str, ...]]
 """Kind of an episode, and the causes of its end: for each key, one episode is kept per iteration."""
@@ -189,7 +189,7 @@ class FailureRecorder(StepObserver):
                 parts = {"kind": "failure", "episodes": [kept.episode], "worlds": worlds, "failure": failure}
                 header = self._header.model_copy(update={**parts, "follows_constants": kept.follows_constants})
                 write_trajectory(self._folder / name, header, tensors | kept.tensors, parents=False)
-            if batch.returns:  # needed after a resumption, even if no episode is recorded yet
+            if batch.returns:  # a resumed training needs these returns, even if no episode is recorded yet
                 with disk_errors(self._folder):
                     self._folder.mkdir(exist_ok=True)
                 recent = _RecentReturns(step=batch.step, returns=batch.returns)

@@ -374,7 +374,8 @@ def content_digest(tensors: Mapping[str, Tensor], document: Mapping[str, Any]) -
     for name in sorted(tensors):
         value = tensors[name].contiguous()
         digest.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
-        digest.update(value.flatten().view(torch.uint8).numpy().data if value.numel() else b"")  # without a copy
+        # `data` is a view: the tensor is not copied
+        digest.update(value.flatten().view(torch.uint8).numpy().data if value.numel() else b"")
     return digest.hexdigest()
 
 

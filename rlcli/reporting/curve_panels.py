@@ -1,4 +1,4 @@
-"""Panels of a picture of learning curves: one for each metric, and one for all terminations."""
+"""Choice of the panels in a picture of learning curves: one panel for each metric, and one for all terminations."""
 
 import difflib
 from collections.abc import Iterable, Sequence

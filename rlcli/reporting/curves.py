@@ -36,7 +36,7 @@ RESAMPLES = 2000
 _LEVEL = 95.0
 """Level of the bootstrap interval [%]."""
 _TRIM = 0.25
-"""Share of the values that the interquartile mean leaves out at each end."""
+"""Fraction of the values that the interquartile mean leaves out at each end."""
 FEWEST_FOR_IQM = 4
 """Smallest number of runs for which the interquartile mean leaves values out; for fewer runs it is the mean."""
 _MAX_POINTS = 1000

@@ -97,7 +97,8 @@ def draw(file: Path, maps: Sequence[HeatMap]) -> None:
     import matplotlib
     from matplotlib.figure import Figure
 
-    settings: dict[str, Any] = {"svg.hashsalt": "rlcli", "text.parse_math": False}  # a fixed salt: reproducible bytes
+    # a fixed salt makes the bytes of the SVG file reproducible
+    settings: dict[str, Any] = {"svg.hashsalt": "rlcli", "text.parse_math": False}
     with matplotlib.rc_context(settings):
         width, height = max(len(m.columns.values) for m in maps), max(len(m.rows.values) for m in maps)
         size = (len(maps) * max(3.6, 0.75 * width + 2.0), max(2.2, 0.5 * height + 1.6))
@@ -121,5 +122,6 @@ def _draw_map(axes: Any, heat_map: HeatMap) -> None:
     axes.set_yticks(range(len(heat_map.rows.values)), heat_map.rows.values)
     for y, row in enumerate(heat_map.cells):
         for x, value in enumerate(row):
-            colour = "black" if 0.15 < shares[y][x] < 0.85 else "white"  # the ends of the colour map are dark
+            # white on both ends of the colour map, which are dark
+            colour = "black" if 0.15 < shares[y][x] < 0.85 else "white"
             axes.text(x, y, f"{value:.2f}", ha="center", va="center", fontsize=9, color=colour)

@@ -1,4 +1,4 @@
-"""HTML of the page of `rlcli report`: one file without scripts and external resources, with all text escaped."""
+"""Renderer of the HTML page of `rlcli report`: one file without scripts or external resources, with escaped text."""
 
 import base64
 import functools

@@ -1,4 +1,4 @@
-"""Evaluation and video for the HTML report of a run: taken from the run's folder, or made if they are missing."""
+"""Evaluation and video for the HTML report of a run: read from the run's folder, or made if they are missing."""
 
 import logging
 from functools import cached_property
@@ -14,9 +14,9 @@ from rlcli.runs.safe_io import read_errors, read_file, require_inside
 _log = logging.getLogger(__name__)
 
 _EPISODES = 200
-"""Episodes of an evaluation that is made for a report."""
+"""Number of episodes of an evaluation that is made for a report."""
 _MAX_VIDEO_S = 20.0
-"""Longest video that is made for a report [s]."""
+"""Largest length of a video that is made for a report [s]."""
 _MAX_VIDEO_BYTES = 24 * 2**20
 """Largest video that a report contains."""
 

@@ -31,7 +31,7 @@ from rlcli.registry import TaskSource
 from rlcli.reporting.card_text import columns_text, modifier_text, noise_text, number, span, text_of, when_text
 
 CODE, NUMBER, TEXT = "code", "number", "text"
-"""Kinds of a table's columns: names in code, numbers, sentences."""
+"""Kinds of columns in a table, which set their font and alignment: names in code, numbers, sentences."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -323,7 +323,7 @@ _HOOKS = {
     "calculate_metrics": "Reward",
     "is_done": "Termination",
 }
-"""Hook of a direct task -> the part of the task that it decides."""
+"""Hook (method) of a direct task -> the part of the task that it computes."""
 
 
 def _direct(task: TaskConfig, source: TaskSource | None) -> Iterable[Table]:

@@ -1,1 +1,1 @@
-"""Commands that run many trainings: several seeds, sweeps (hyperparameter search), benchmarks of speed."""
+"""Modules that run many trainings: with several seeds, in a sweep (hyperparameter search), or to measure speed."""

@@ -33,7 +33,7 @@ from rlcli.training.setup import make_trainer
 SIZES = (16, 64, 256, 1_024, 4_096, 16_384)
 """Numbers of environments that are measured."""
 HORIZONS = ("num_steps", "n_steps", "num_steps_per_env", "train_freq")
-"""Names that trainers use for the steps of one environment in an iteration."""
+"""Keys that trainers use for the number of steps of each environment in an iteration."""
 UNSTEADY = 0.15
 """Relative spread above which a measurement is repeated, and the machine is reported as busy."""
 WORTH = 0.97
@@ -55,7 +55,7 @@ class Pace:
     rounds: int = 3
     """Largest number of rounds, if the blocks differ by more than UNSTEADY."""
     longest_s: float = 4.0
-    """A size whose step would take longer [s] is left out."""
+    """Duration of a step [s] above which a number of environments is not measured."""
 
 
 QUICK = Pace(block_s=0.05, blocks=3, rounds=1, longest_s=1.0)
@@ -63,7 +63,7 @@ QUICK = Pace(block_s=0.05, blocks=3, rounds=1, longest_s=1.0)
 
 @dataclass(frozen=True, slots=True)
 class Stepped:
-    """Speed of a number of environments with random actions, without training."""
+    """Measured speed of the environments with random actions, without training, for one number of environments."""
 
     num_envs: int
     engine_threads: int
@@ -152,7 +152,7 @@ class _Training:
 
     trainer: Trainer
     blocks: list[float] = field(default_factory=list)
-    """Mean duration of an iteration in each block [s]."""
+    """Mean duration of an iteration in each block of repeated calls [s]."""
     seconds: list[Mapping[str, float]] = field(default_factory=list)
     """Part -> duration [s], for each iteration."""
 
@@ -333,7 +333,10 @@ class Bench:
             yield _Training(trainer)
 
     def _compare(self, best: Trained) -> None:
-        """Measure the fastest and the present setting again in alternation, so that other load affects both alike."""
+        """Measure the fastest and the present setting again, in alternation.
+
+        Other programs that load the machine then slow down both settings equally.
+        """
         present = self.findings.trained[0]
         if best.setting == present.setting:
             self.findings.present = self.findings.recommended = present

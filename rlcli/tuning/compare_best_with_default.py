@@ -1,4 +1,7 @@
-"""Training for `rlcli sweep compare`: time to a threshold with the best trial's settings and with the task's own."""
+"""Comparison of `rlcli sweep compare`: how long training takes to reach a threshold, with two kinds of settings.
+
+One kind are the settings of a sweep's best trial, the other the task's own settings.
+"""
 
 import logging
 import tempfile
@@ -27,7 +30,7 @@ from rlcli.tuning.sweep import Sweep
 _log = logging.getLogger(__name__)
 
 ARMS = {"default": "the task's own settings", "best": "best trial"}
-"""The two compared settings: name in JSON -> name in messages."""
+"""The two kinds of settings that are compared: name in JSON documents -> name in messages."""
 
 
 @dataclass(slots=True)

@@ -22,12 +22,12 @@ if TYPE_CHECKING:
 
 JOURNAL = "journal.log"
 _CONNECT_S = 20
-"""Time that a database may take to answer [s]."""
+"""Time after which a database that does not answer is an error [s]."""
 _WITH_CONNECT_TIMEOUT = ("postgresql", "psycopg", "psycopg2", "mysql", "mysqldb", "pymysql")
-"""Drivers of SQLAlchemy, and dialects with such a default driver, that have the option `connect_timeout`."""
+"""Database drivers of SQLAlchemy, and dialects that use them by default, which have the option `connect_timeout`."""
 _MAX_JOURNAL = 512 * 2**20
 _ATTEMPTS = 5
-"""Attempts to create the tables of a database."""
+"""Number of attempts to create the tables of a database: another machine may create them at the same time."""
 
 
 def check_optuna() -> None:

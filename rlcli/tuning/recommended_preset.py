@@ -1,4 +1,7 @@
-"""Preset of `rlcli bench`: a file for `--config` with the recommended settings, and the measurements in comments."""
+"""Text of the preset that `rlcli bench` writes: a file for `--config` with the recommended settings.
+
+Comments in the file contain the measurements.
+"""
 
 from collections.abc import Mapping
 from datetime import UTC, datetime

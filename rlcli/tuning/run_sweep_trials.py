@@ -28,9 +28,9 @@ _REPORT_EVERY_S = 1.0
 _PRUNER_STEPS = 100
 """Steps of the pruner: it compares trials at each percent of their budget."""
 _MAX_FAILURES = 3
-"""Failed trials, without a successful one, after which the sweep ends with an error."""
+"""Number of failed trials after which a sweep without a successful trial ends with an error."""
 _NOT_CAUSED_BY_TRIAL = (7, 8, 10, STOPPED, INTERRUPTED)
-"""Exit codes that do not depend on the settings of a trial: a missing package or device, the machine, a signal."""
+"""Exit codes of errors that no setting of a trial has caused: missing package, missing device, machine, signal."""
 
 
 def check_parameters(request: TrainingRequest, parameters: Sequence[Parameter], objective: Objective) -> Resolved:
@@ -88,7 +88,7 @@ class _Stage:
     next_report: float = 0.0
     """Time of the next report to the pruner [s], by `time.monotonic`."""
     trained_s: float = 0.0
-    """Time of the rollouts and updates so far [s]."""
+    """Training time (rollouts and updates) so far [s]."""
     counted: int = 0
     """Iterations that are included in `trained_s`."""
 

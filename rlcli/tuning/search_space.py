@@ -1,4 +1,4 @@
-"""Search space (`--param`) and objective (`--objective`) of a sweep, parsed from the command line."""
+"""Parsers for the search space (`--param`) and the objective (`--objective`) of a sweep."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ from rlcli.envs.vec_env import VecEnv
 from rlcli.managers.term_binding import BoundTerm
 
 _WARM_UP = 32
-"""Number of steps before the measurement, and smallest number of measured steps."""
+"""Number of steps before the measurement starts; also the smallest number of measured steps."""
 _Stage = tuple[str, list[Callable[..., Any]], list[tuple[str, Callable[..., Any]]]]
 """A stage of the step: its name, its methods, and its terms as (name, function)."""
 

@@ -35,11 +35,11 @@ PRESET = "best.yaml"
 PICTURE = "sweep.svg"
 _SWEEP_LOCK, _TRIAL_LOCK = ".sweep", ".worker"
 _SETTINGS = "rlcli"
-"""Attribute of an Optuna study with the settings of the sweep, which are equal in all processes."""
+"""Name of the Optuna study's attribute that stores the settings of the sweep, equal in all processes."""
 _LOCATION = "place"
-"""Attribute of a trial with the machine and the folder of its run; the trial can only be resumed there."""
+"""Name of the trial's attribute that stores machine and folder of its run; only there the trial can be resumed."""
 _SURPLUS = "surplus"
-"""Attribute of a trial that another machine started in excess of the wanted number; it does not count."""
+"""Name of the attribute that marks a trial beyond `--trials`, which another machine started; it does not count."""
 _ENDED = ("COMPLETE", "PRUNED", "FAIL")
 
 
@@ -179,7 +179,7 @@ class Sweep:
         }
 
     def claim(self) -> Trial | None:
-        """Return a trial to run: an unfinished one whose process has died, or a new one; None if none is left.
+        """Return a trial for this process to run: an unfinished one whose process has died, or a new one; else None.
 
         A lock lets one process claim a trial at a time: no trial starts twice, and at most `--trials` trials start.
         """

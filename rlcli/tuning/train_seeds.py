@@ -26,7 +26,7 @@ _log = logging.getLogger(__name__)
 CURVES = "curves.csv"
 PICTURE = "curves.svg"
 METRICS = {"return": "Train/mean_reward", "success": "Train/success_rate"}
-"""Name in tables and JSON documents -> name in metrics.jsonl."""
+"""Name of a metric in tables and JSON documents -> its name in metrics.jsonl."""
 
 
 class StudyView(AbstractContextManager[Any], Protocol):

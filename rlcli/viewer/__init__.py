@@ -1,1 +1,1 @@
-"""Viewers of environments (a native window, the browser), and videos rendered without a window."""
+"""Viewers that show environments in a window or in the browser, and videos that are rendered without a window."""

@@ -1,4 +1,4 @@
-"""Checkpoints of a run for a viewer, which can switch between them while the run is still training."""
+"""Loader of a run's checkpoints for a viewer, which can switch between them while the run is still training."""
 
 from dataclasses import dataclass
 

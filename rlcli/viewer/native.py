@@ -22,7 +22,7 @@ KEYS = (
     " Double click, then Ctrl and drag: push a body"
 )
 _REQUESTS = {code: request for request, (code, _) in REQUEST_KEYS.items()}
-"""Key code of GLFW -> name of a request, as in `Playback.requests`."""
+"""Key code of GLFW (the window library) -> name of the request that the key submits, as in `Playback.requests`."""
 
 
 def run(playback: Playback, *, title: str, num_drawn: int, port: int, ready: Ready) -> None:
@@ -59,7 +59,7 @@ def run(playback: Playback, *, title: str, num_drawn: int, port: int, ready: Rea
 
             run_in_real_time(playback, window.is_running, draw)
     finally:
-        for thread in drawing:  # the process crashes if it exits while one of them draws
+        for thread in drawing:  # the process would crash if it exits while one of these threads draws
             thread.join(timeout=5.0)
 
 

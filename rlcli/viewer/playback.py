@@ -29,7 +29,7 @@ _log = logging.getLogger(__name__)
 SPEEDS = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 """Speeds of a playback, as multiples of real time."""
 _LAG = 0.25
-"""Longest real time that one call of `advance` catches up with [s]."""
+"""Largest delay behind real time that one call of `advance` makes up for [s]."""
 _FRAME_S = 1.0 / 60.0
 _REFRESH_S = 1.0
 """Time between two reads of the list of checkpoints [s]."""

@@ -1,4 +1,4 @@
-"""Interfaces between viewers and playback: the table of viewers, their protocol, and the state that they show.
+"""Interfaces between viewers and playback: table of viewers, protocol of a viewer, and the state that viewers show.
 
 A new viewer is a module in this folder with a function of the protocol `Viewer`, and a line in `VIEWERS`. The section
 "A viewer" of CONTRIBUTING.md lists the other places that name the viewers.
@@ -88,11 +88,11 @@ class View:
     follow: bool
     """Whether each new checkpoint is played as soon as it appears."""
     knobs: tuple[Knob, ...]
-    """Numbers of the task's commands that the user can set, such as the velocity `vx`, each with its range."""
+    """Components of the task's commands that the user can set, such as the velocity `vx`, each with its range."""
     commands: tuple[float, ...]
-    """Value of each knob in the shown environment."""
+    """Present value of each item of `knobs` in the shown environment."""
     held: Mapping[str, float]
-    """Values that the user holds, by the name of the knob."""
+    """Commands that the user holds at a value: name of the item of `knobs` -> value."""
     knob: int
-    """Index of the knob that the keys change."""
+    """Index of the item of `knobs` that the keys change."""
     message: str

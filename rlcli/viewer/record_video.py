@@ -1,4 +1,4 @@
-"""Videos of one episode: from a policy, a recording or a failure case."""
+"""Functions that write a video of one episode: of a policy that acts, of a recording, or of a failure case."""
 
 import contextlib
 from collections.abc import Callable, Iterable, Iterator

@@ -1,4 +1,4 @@
-"""MuJoCo's web viewer with access control: it serves only its own page, on the loopback interface, and prints nothing.
+"""Access control for MuJoCo's web viewer: it serves only its own page, only on this machine, and prints nothing.
 
 MuJoCo's web viewer (`mujoco.studio`, private and new in 4.0) listens on every interface, answers requests of any page
 and loads models from them. The files of that package stay unchanged: while a viewer runs, this module replaces the few
@@ -44,7 +44,7 @@ _REQUIRED_NAMES = {
 """Module of `mujoco.studio` -> the names that are used from it."""
 _MAX_MESSAGE_BYTES = 2**20
 _UNSUPPORTED_DATA = 1003
-"""Code of a closed WebSocket (RFC 6455): the type of data cannot be accepted."""
+"""Status code with which a WebSocket is closed (RFC 6455) because its type of data is not accepted."""
 _REQUEST_S = 10.0
 """Time after which the server closes a connection without a complete request [s]."""
 

@@ -1,4 +1,7 @@
-"""Videos during a training (`--video-every`): one episode of the current policy, in a separate environment."""
+"""Recorder of videos during a training (`--video-every`): one episode of the current policy.
+
+The episode runs in a separate environment, so that the training does not change.
+"""
 
 import logging
 from collections.abc import Callable

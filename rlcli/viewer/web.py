@@ -1,4 +1,4 @@
-"""Viewer in the browser: MuJoCo's own web viewer."""
+"""Viewer in the browser; it uses MuJoCo's own web viewer, with access control."""
 
 import contextlib
 import copy
@@ -22,7 +22,7 @@ _VISIBLE_FIELDS = (
     *("geom_size", "geom_pos", "geom_quat", "geom_rgba", "geom_type", "geom_dataid", "geom_matid", "mat_", "light_"),
     *("site_size", "site_pos", "site_quat", "site_rgba", "body_pos", "body_quat", "jnt_pos", "jnt_axis", "qpos0"),
 )
-"""Prefixes of the model fields that change the image."""
+"""First parts of the names of model fields that change the image, such as colours and sizes of geoms."""
 
 
 def run(playback: Playback, *, title: str, num_drawn: int = 1, port: int, ready: Ready) -> None:

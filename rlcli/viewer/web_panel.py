@@ -1,4 +1,4 @@
-"""Panel of the browser's viewer: the controls beside the scene, and the keys.
+"""Panel of the browser's viewer: controls beside the scene (buttons, sliders, plots), and keyboard shortcuts.
 
 The panel runs in the viewer's thread. It reads the playback's view and submits requests; it changes nothing else. The
 force on a dragged body is applied in the simulation; other edits in the page have no effect on it.
@@ -135,7 +135,7 @@ class WebPanel(plugin.ViewerPlugin):  # type: ignore[misc]  # MuJoCo has no type
         if page.x < _NARROW:
             imgui.SetNextWindowPos(imgui.Vec2(0.0, 0.55 * page.y))
             imgui.SetNextWindowSize(imgui.Vec2(page.x, 0.45 * page.y))
-            imgui.Begin(f"{TITLE}###narrow", flags=_FIXED)  # another window than the one that the layout docks
+            imgui.Begin(f"{TITLE}###narrow", flags=_FIXED)  # another window than the docked one
             return
         imgui.Begin(TITLE)
         node = imgui.GetWindowDockID()
