@@ -24,11 +24,11 @@ def shorten(value: object, limit: int, mark: str = "...") -> str:
 
 
 _LONG = re.compile(r"""\S{201,}|(?<!\w)'[^']{199,}'|"[^"]{199,}\"""")
-"""A word or a quoted text of over 200 characters."""
+"""Pattern of a word or a quoted text of over 200 characters."""
 _MAX_ECHO, _MAX_LINE = 200, 2000
 """Largest part of an input that a message repeats, and largest length of a line of a message [characters]."""
 _inputs: deque[str] = deque(maxlen=1000)
-"""Words of the command line and texts of files that are longer than `_MAX_ECHO` when they are printed."""
+"""Inputs (words of the command line, texts of files) whose printed form is longer than `_MAX_ECHO`."""
 _input_pieces: set[int] = set()
 """Hashes of all parts of `_inputs` with `_MAX_ECHO` + 1 characters; empty until a long message needs them."""
 

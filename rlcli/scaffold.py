@@ -109,7 +109,7 @@ def check_name(name: str) -> None:
 
 
 def render(name: str, flavour: str, summary: str = "", *, has_pose: bool = True) -> dict[str, str]:
-    """Return the files of a new task's package, from the templates: path within the package's folder -> text."""
+    """Return the texts of all files of a new package, by path within the package's folder, from the templates."""
     import jinja2
 
     package = name.replace("-", "_")

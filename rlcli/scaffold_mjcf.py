@@ -1,4 +1,4 @@
-"""Properties of a robot for `rlcli new --robot FILE.xml`: joints, efforts, default pose, height, asset files."""
+"""Analysis of a robot's MJCF for `rlcli new --robot FILE.xml`: joints, efforts, default pose, height, asset files."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ _USUAL_DT, _REACH_DT = 0.002, 0.005
 _MAX_DECIMATION = 20
 """Largest number of physics steps in a control period. A small robot with a short time step moves faster."""
 _VIEW = np.array([4.0, 4.0, 3.0])
-"""Direction from the robot to the camera."""
+"""Direction from the robot to the camera, world frame. (x, y, z)"""
 _ROOT = 1
-"""The first body: the root of an entity."""
+"""Id of the robot's root in the compiled model: the first body after the world."""
 
 
 class Robot:
@@ -190,7 +190,7 @@ class Robot:
         return bool(resistance > abs(self.max_effort(joint)))
 
     def joint_settings(self, kind: str) -> dict[str, dict[str, float]]:
-        """Return joint name -> kp, kv and effort_limit, for joints without a position actuator in the file.
+        """Return kp, kv and effort_limit, by joint name, for the joints without a position actuator in the file.
 
         The joints of a walking robot are compliant. Those of an arm follow their targets with a lag of 0.1 s, so stiff
         that gravity displaces the last body by a small part of its workspace.
@@ -204,7 +204,7 @@ class Robot:
             if joint in stiff:
                 kp, kv = stiff[joint]
             else:
-                # the whole effort at an error of 0.1 m or 1 rad
+                # the largest effort is reached at an error of 0.1 m or 1 rad
                 kp = effort * (10.0 if self.model.jnt_type[joint] == SCALAR[1] else 1.0)
                 kv = 2.0 * 0.5 * math.sqrt(kp * self.inertia[joint])  # damping ratio 0.5
             settings[self.name(joint)] = {"kp": round3(kp), "kv": round3(kv), "effort_limit": round3(effort)}
@@ -215,7 +215,7 @@ class Robot:
         return joint in self.actuator and bool(self.model.actuator_biasprm[self.actuator[joint], 1] < 0.0)
 
     def _stiff_gains(self) -> dict[int, tuple[float, float]]:
-        """Return joint -> kp and kv of stiff, overdamped servos.
+        """Return the gains (kp, kv) of stiff, overdamped servos, by joint id.
 
         Gravity turns a point mass at the distance r by g / (r w^2), so w^2 = g / d gives a displacement of d at any r.
         """
@@ -300,7 +300,7 @@ class Robot:
         return list(dict.fromkeys(found))
 
     def _inertia(self, data: mujoco.MjData) -> dict[int, float]:
-        """Return joint id -> diagonal element of the mass matrix in the pose of `data` [kg or kg m^2]."""
+        """Return the diagonal elements of the mass matrix in the pose of `data`, by joint id [kg or kg m^2]."""
         matrix = np.zeros((self.model.nv, self.model.nv))
         mujoco.mj_fullM(self.model, data, matrix)
         return {j: float(matrix[self.model.jnt_dofadr[j], self.model.jnt_dofadr[j]]) for j in self.joints}
@@ -346,7 +346,10 @@ class Robot:
         return -largest, largest
 
     def action_scales(self) -> dict[str, float]:
-        """Return joint name -> a quarter of the range of positions in which goals are drawn, at most 1 [m or rad]."""
+        """Return the scale of each joint's action, by joint name [m or rad].
+
+        It is a quarter of the range of positions in which goals are drawn, and at most 1.
+        """
         scales = {}
         for joint in self.driven:
             low, high = self.model.jnt_range[joint] if self.model.jnt_limited[joint] else self.offsets()

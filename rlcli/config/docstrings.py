@@ -25,7 +25,7 @@ def describe(schema: dict[str, Any], model: type[BaseModel]) -> None:
 
 @functools.cache
 def _class_docstrings(module: ModuleType) -> dict[str, dict[str, str]]:
-    """Return the docstrings of a module: qualified class name -> field -> the string below the field.
+    """Return the docstrings below the fields of a module's classes: result[qualified class name][field].
 
     Two classes with the same qualified name are left out, because the right one is unknown.
     """

@@ -128,7 +128,7 @@ def to_yaml_with_origins(resolved: Resolved, data: dict[str, Any] | None = None)
 
 
 def origins(resolved: Resolved, data: dict[str, Any] | None = None) -> dict[str, str]:
-    """Return dotted key -> origin (the file and line, override or flag that set the value; `default` if none did).
+    """Return the origin of each value, by dotted key: file and line, an override, a flag, or `default`.
 
     Args:
         resolved: the configuration.
@@ -141,7 +141,7 @@ def origins(resolved: Resolved, data: dict[str, Any] | None = None) -> dict[str,
 
 
 def explicit_values(resolved: Resolved) -> dict[str, str]:
-    """Return dotted key -> origin of the values that the command line or a `--config` file sets."""
+    """Return the origins, by dotted key, of only those values that the command line or a `--config` file sets."""
     return {messages.dotted(path): _location(origin) for path, origin in _explicit_origins(resolved)}
 
 

@@ -83,7 +83,7 @@ def format_value(value: object) -> str:
 
 
 def key_locations(models: Mapping[str, type[BaseModel]]) -> dict[str, list[str]]:
-    """Return each key of some models -> the dotted paths at which the key is allowed.
+    """Return, for each key of some pydantic models, the dotted paths at which a task file may have the key.
 
     `models` maps the dotted path of a model in the configuration to the model; the path of the task's model is ''.
     """

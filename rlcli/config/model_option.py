@@ -18,7 +18,7 @@ MODELS = "models"
 
 
 def read_models(words: Iterable[str]) -> dict[str, Any]:
-    """Return the name of each robot or object -> its MJCF file, from the values of `--model`.
+    """Return the MJCF file of each robot or object, by its name, from the values of `--model`.
 
     A value is `NAME=FILE`, or a YAML file with `{NAME: FILE}`. FILE is the path of an MJCF file, or `TASK:FILE` for a
     file of an installed task. Paths in a YAML file are relative to that file. A YAML file may also have `NAME: {model:

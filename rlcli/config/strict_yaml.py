@@ -105,7 +105,7 @@ def _after(before: str) -> Mark:
 
 
 def _parse(text: str) -> tuple[Any, dict[Path, Mark]]:
-    """Return the parsed value of a YAML text, and path -> position (line, column).
+    """Return the parsed value of a YAML text, and the positions (line, column) of its keys and items, by path.
 
     Both are copies of the cached result, so the caller may change them.
     """
@@ -178,7 +178,7 @@ def _checked_events(text: str) -> Iterator[events.Event]:
 
 
 def _read(text: str) -> tuple[Any, dict[Path, Mark]]:
-    """Return the parsed value of a YAML text, and path -> position (line, column) of every key and list item."""
+    """Return the parsed value of a YAML text, and the position (line, column) of every key and list item, by path."""
     reader = _Reader(_checked_events(text))
     root = [reader.value(event, ()) for event in reader.stream if isinstance(event, events.NodeEvent)]
     return root[0] if root else None, reader.marks

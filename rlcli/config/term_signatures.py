@@ -33,7 +33,7 @@ SECTIONS: dict[str, type[schema.TermConfig]] = {
     "curriculum": schema.CurriculumConfig,
     "success": schema.SuccessConfig,
 }
-"""Section of the YAML -> model of the keys that all its terms share."""
+"""Section of a task file, such as rewards -> pydantic model of the keys that all its terms share."""
 
 SELECTORS = ("Joints", "Bodies", "Sites", "Sensors", "Actuators", "Geoms", "Tendons", "Pairs")
 """Names in `rlcli.task` for annotations of parameters whose value selects elements of the term's `entity` by name."""
@@ -223,7 +223,7 @@ def params_model(signature: Signature, section: str) -> type[schema.TermConfig]:
 
 @functools.cache
 def _builtin_params_model(name: str, section: str) -> type[schema.TermConfig]:
-    """Return the model of a built-in term. It is cached because building a model takes several milliseconds."""
+    """Return the pydantic model of a built-in term's keys; it is cached, because building one takes milliseconds."""
     return _params_model(builtin_terms(section)[name], section)
 
 
@@ -388,7 +388,7 @@ def _literal(node: ast.expr) -> Any:
 
 
 def _field_default(node: ast.expr | None) -> Any:
-    """Return the default of a field of `Params` for pydantic's `create_model`: `...` for a required field."""
+    """Return the default of a field of `Params` as pydantic's `create_model` takes it: `...` for a required field."""
     if node is None:
         return ...
     if isinstance(node, ast.Call) and last_name(node.func) == "Field":

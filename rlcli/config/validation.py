@@ -436,7 +436,7 @@ class TaskCheck:
 
 @functools.lru_cache(maxsize=16)
 def _key_locations(prefix: str, agent: type[BaseModel]) -> messages.KeyLocations:
-    """Return each key of a task and of an agent -> the dotted paths where it is allowed. `prefix`: agent's path."""
+    """Return, for each key of a task and of an agent (at path `prefix`), the dotted paths where it is allowed."""
     return messages.key_locations({"": TaskConfig, prefix: agent})
 
 

@@ -94,7 +94,7 @@ def metadata_of(
 
 
 def required_inputs(metadata: dict[str, Any]) -> dict[str, int]:
-    """Return name -> number of values of the inputs that `Controller.act` of `run_policy.py` needs.
+    """Return the number of values of each input that `Controller.act` of `run_policy.py` needs, by name.
 
     The inputs are the commands, and the observations without a formula, which only the task's code can compute.
     """

@@ -124,7 +124,7 @@ def _variables_check() -> Check:
 
 
 def harmful_variables(variables: dict[str, str], cores: int) -> dict[str, str]:
-    """Return the environment variables whose values make training slower: name -> reason.
+    """Return the environment variables whose values make training slower, as a mapping from name to reason.
 
     Args:
         variables: name -> value of environment variables.

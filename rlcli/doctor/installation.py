@@ -136,7 +136,7 @@ def _mujoco_packages_check() -> Check:
 
 
 def _copies(name: str) -> dict[str, str]:
-    """Return every installation of a package (folder -> version); Python imports the first one."""
+    """Return the version of every installation of a package, by folder; Python imports the first one."""
     found: dict[str, str] = {}
     for distribution in metadata.distributions(name=name):
         folder = Path(str(getattr(distribution, "_path", "?"))).parent

@@ -256,7 +256,7 @@ class DirectEnv(VecEnv):
                 yield name, value
 
     def metric_values(self) -> dict[str, Tensor]:
-        """Return the numbers and the tensors of the task's `extras`, as `Task/NAME` -> value."""
+        """Return the numbers and the tensors of the task's `extras`, by the name of the metric, `Task/NAME`."""
         return {f"Task/{name}": value for name, value in self._extra_tensors()}
 
     def step_metrics(self) -> dict[str, Tensor]:

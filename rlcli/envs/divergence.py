@@ -41,7 +41,7 @@ class DivergenceGuard:
         return self._quarantine_causes + Counter(self._env.engine.divergence_causes)
 
     def metrics(self) -> dict[str, float]:
-        """Return `Sim/diverged/CAUSE` -> number of environments that have diverged since the last call."""
+        """Return the metrics `Sim/diverged/CAUSE`: numbers of environments that diverged since the last call."""
         causes = self.causes
         new, self._logged_causes = causes - self._logged_causes, causes
         return {f"Sim/diverged/{cause.replace(' ', '_')}": float(count) for cause, count in new.items()}

@@ -119,7 +119,7 @@ class Environment(Protocol):
         return []
 
     def extras(self) -> dict[str, float]:
-        """Return the values to log, as metric name -> value.
+        """Return the values to log, by the names of the metrics.
 
         They are the means of a direct task's `extras` or of the curriculum's values, and the number of divergences
         since the last call, by cause.

@@ -327,11 +327,11 @@ class VecEnv(Workflow):
             actuator.compute()
 
     def extras(self) -> dict[str, float]:
-        """Return the values to log, as metric name -> value; see `Environment.extras`."""
+        """Return the values to log, by the names of the metrics; see `Environment.extras`."""
         return {**means(self.metric_values()), **self.divergence_metrics()}
 
     def divergence_metrics(self) -> dict[str, float]:
-        """Return `Sim/diverged/CAUSE` -> number of environments that have diverged since the last call."""
+        """Return the metrics `Sim/diverged/CAUSE`: numbers of environments that diverged since the last call."""
         return self._guard.metrics()
 
     def close(self) -> None:

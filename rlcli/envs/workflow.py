@@ -96,7 +96,7 @@ class Workflow(Environment):
         return self._compute_observations()
 
     def metric_values(self) -> dict[str, Tensor]:
-        """Return name -> values of the newest step, whose mean is logged; their shape is free.
+        """Return the tensors of the newest step whose means are logged, by name; they may have any shape.
 
         They are the `extras` of a direct task, or the values of the curriculum.
         """

@@ -155,7 +155,7 @@ def _name_and_origin(source: TaskSource) -> str:
 
 
 def _settings(resolved: Resolved) -> dict[str, Any]:
-    """Return dotted key -> value of a task's configuration, without keys that do not affect episodes."""
+    """Return the values in a task's configuration that affect episodes, by dotted key."""
     from rlcli.config.dump import to_data
 
     values = leaves(to_data(resolved))
@@ -167,7 +167,7 @@ def _settings(resolved: Resolved) -> dict[str, Any]:
 
 
 def _compare_pair(left: Evaluation, right: Evaluation) -> dict[str, Any]:
-    """Return metric -> paired difference (left - right) of two evaluations, and probability that `left` is better.
+    """Compare two evaluations metric by metric: difference (left - right), and probability that `left` is better.
 
     Episode i of both evaluations must have the same random numbers.
     """

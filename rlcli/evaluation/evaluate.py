@@ -177,7 +177,7 @@ class _EpisodeMeans(StepObserver):
             steps += 1.0
 
     def finish(self, ids: Tensor) -> dict[str, list[float]]:
-        """Return metric -> its mean over the episode that has just ended in each environment of `ids`.
+        """Return the mean of each metric over the episodes that have just ended in the environments `ids`, by metric.
 
         The sums of these environments are set to 0 for their next episodes.
         """

@@ -123,7 +123,7 @@ def format_value(value: float) -> str:
 
 
 def by_name(sweeps: Sequence[Sweep], point: Point) -> dict[str, float]:
-    """Return parameter name -> value for a variant (`point`) of the task."""
+    """Return the values of the parameters in a variant (`point`) of the task, by the names of the parameters."""
     return {sweep.name: value for sweep, value in zip(sweeps, point, strict=True)}
 
 

@@ -204,7 +204,7 @@ def _framework_packages() -> frozenset[str]:
 
 
 def known_trainers() -> dict[str, str]:
-    """Return the name of each trainer in `known_plugins.json` -> the arguments of `pip install` for its plugin."""
+    """Return the arguments of `pip install` for the plugin of each trainer in `known_plugins.json`, by trainer name."""
     return dict(_known_plugins()["trainers"])
 
 

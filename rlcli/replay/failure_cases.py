@@ -78,7 +78,10 @@ class FailureCase:
         return array
 
     def columns(self, name: str) -> dict[str, NDArray[np.float32]]:
-        """Return column name -> recorded values (steps,). `name` is observations, actions or reward_terms."""
+        """Return the recorded values of each column, (steps,), by the name of the column.
+
+        `name` chooses the kind of columns: observations, actions or reward_terms.
+        """
         names = getattr(self.trajectory.header.columns, name)
         return dict(zip(names, self.values(name).T, strict=True))
 

@@ -101,7 +101,7 @@ class StateReader(StepObserver):
 
 
 def read_state(env: VecEnv) -> dict[str, Tensor]:
-    """Return copies of the fields of the state that a recording holds: field name -> values (num_envs, n)."""
+    """Return copies of the state fields that a recording holds, by the name of the field. (num_envs, n) each"""
     return {name: env.engine.field(name).detach().cpu().clone() for name in STATE_FIELDS}
 
 

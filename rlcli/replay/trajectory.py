@@ -273,7 +273,7 @@ class Trajectory:
         return {n.removeprefix(prefix): tensor for n, tensor in self.tensors.items() if n.startswith(prefix)}
 
     def of_episodes(self) -> dict[int, dict[str, Tensor]]:
-        """Return episode number -> the tensors of the episode, by their names without the prefix `episode.K.`."""
+        """Return the tensors of each episode: result[episode number][name without the prefix `episode.K.`]."""
         found: dict[int, dict[str, Tensor]] = {number: {} for number in range(len(self.header.episodes))}
         for name, tensor in self.part("episode.").items():
             number, _, rest = name.partition(".")

@@ -262,7 +262,10 @@ def align(lines: Sequence[tuple[Array, Array]]) -> tuple[Array, Array] | None:
 
 
 def _settings(run: Run) -> dict[str, Any]:
-    """Return all settings of a run except its seed, to find runs that differ only in the seed: dotted key -> value."""
+    """Return the values of all settings of a run except its seed, by dotted key.
+
+    Runs with equal settings differ only in their seed, and become one curve.
+    """
     task, record = run.record["task"], run.record
     values = {dotted(path): value for path, value in leaves(run.read_config().data)}
     sources = record.get("sources", {}).items()

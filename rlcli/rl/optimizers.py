@@ -36,7 +36,7 @@ def below(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
 
 
 def optimizer_tensors(optimizer: torch.optim.Optimizer, prefix: str) -> dict[str, Tensor]:
-    """Return a copy of an optimiser's state as name -> tensor.
+    """Return a copy of an optimiser's state as tensors by name.
 
     A name is the prefix, the index of a parameter, and the name of Adam's value: `0.exp_avg`.
     """

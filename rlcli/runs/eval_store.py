@@ -1,4 +1,4 @@
-"""Evaluations stored in a run: the last result of `rlcli eval` for each checkpoint."""
+"""Reader and writer of the evaluations stored in a run: the last result of `rlcli eval` for each checkpoint."""
 
 import re
 from collections.abc import Mapping
@@ -13,7 +13,7 @@ from rlcli.runs.run import Run, require_own
 from rlcli.runs.safe_io import FileModel, check_json, read_json
 
 FOLDER = "evaluations"
-"""Folder in a run; its file `STEP.json` belongs to the checkpoint folder of the same name."""
+"""Name of the folder in a run; its file `STEP.json` belongs to the checkpoint whose folder is named STEP."""
 _LIMIT = 1024 * 1024
 _STEP = re.compile("[0-9]{1,30}")
 

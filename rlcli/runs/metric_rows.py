@@ -51,7 +51,10 @@ def read_rows(run: Run, *, strict: bool = False) -> Iterator[dict[str, Any]]:
 
 
 def parse_row(line: bytes) -> dict[str, Any] | None:
-    """Return metric name -> number of one line; None if it is not JSON with integers `iteration` and `step`."""
+    """Return the numbers in one line of the file, by metric.
+
+    Return None if the line is not JSON with the integers `iteration` and `step`.
+    """
     try:
         row = json.loads(line)
     except (ValueError, RecursionError):

@@ -147,7 +147,7 @@ def state_of(run: Run) -> tuple[str, str | None]:
 
 
 def newest_rows(run: Run) -> list[dict[str, Any]]:
-    """Return at most 20 of the last rows (metric -> number) of a run's `metrics.jsonl`, the oldest first."""
+    """Return the last rows (at most 20) of a run's `metrics.jsonl`, the oldest first; a row has numbers by metric."""
     return [*_rows_backwards(run)][::-1]
 
 

@@ -100,7 +100,7 @@ def built_record(model: mujoco.MjModel, device: str) -> dict[str, Any]:
 
 
 def versions(resolved: Resolved) -> dict[str, str]:
-    """Return package -> version of every package that may change the results.
+    """Return the versions of all packages that may change the results, by the name of the package.
 
     These are `PACKAGES`, the packages of the task, of the trainer and of the task's format, and what they require.
     """
@@ -124,7 +124,7 @@ def versions(resolved: Resolved) -> dict[str, str]:
 
 
 def sources(resolved: Resolved) -> dict[str, str]:
-    """Return name -> SHA-256 of each file of the task, and of the source code of rlcli and of the task's format."""
+    """Return SHA-256 hashes, by name: of each file of the task, of rlcli's source code and of the task's format's."""
     root = resolved.source.root.resolve()
     digests = {}
     for file in _task_files(resolved):

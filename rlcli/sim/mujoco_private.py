@@ -69,12 +69,12 @@ def make_batch(
 
 
 def state_columns(batch: Batch) -> dict[str, tuple[int, int]]:
-    """Return field -> (first column, number of columns) in the integration state."""
+    """Return the columns of each field in the integration state, by field: (first column, number of columns)."""
     return {name: batch._component(kind) for name, kind in STATE_FIELDS.items()}
 
 
 def expanded_fields(batch: Batch) -> dict[str, NDArray[Any]]:
-    """Return the batch's own dictionary of model fields with a value for each world: name -> (num_envs, ...)."""
+    """Return the batch's own dictionary with the model fields that have a value for each world. (num_envs, ...)"""
     fields: dict[str, NDArray[Any]] = batch._expanded
     return fields
 

@@ -85,7 +85,7 @@ class TaskUnderTest:
         return f"{own[-1].filename}:{own[-1].lineno}" if own else self.source.label
 
     def agents(self) -> dict[str, Resolved]:
-        """Return the name of each agent -> the task's configuration with this agent's changes.
+        """Return the task's configuration with the changes of each agent, by the name of the agent.
 
         Agents whose trainer is not installed are left out.
         """
@@ -136,7 +136,7 @@ def task_of(env: VecEnv) -> DirectTask:
 
 
 def engine_state(env: VecEnv) -> dict[str, Tensor]:
-    """Return the engine's state, such as positions and velocities: name -> tensor with one row per environment."""
+    """Return the tensors of the engine's state, such as positions and velocities, with one row per environment."""
     state = env.engine.state_dict()
     return {name: value for name, value in state.items() if value.dim() and len(value) == env.num_envs}
 

@@ -210,7 +210,7 @@ class Bench:
         return self.findings
 
     def changes(self, setting: Setting) -> dict[str, Any]:
-        """Return what a setting changes in the configuration: dotted key -> value."""
+        """Return the values of the configuration that a setting changes, by dotted key."""
         changed: dict[str, Any] = {
             "scene.num_envs": setting.num_envs,
             "sim.engine_threads": setting.engine_threads,

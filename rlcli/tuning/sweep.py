@@ -153,7 +153,7 @@ class Sweep:
         return better(done, key=lambda trial: (trial.value, -trial.number if better is max else trial.number))
 
     def values(self, trial: FrozenTrial | optuna.Trial) -> dict[str, Any]:
-        """Return the values of a trial's parameters: key of the configuration -> value."""
+        """Return the values of a trial's parameters, by their keys in the configuration."""
         return {p.key: p.value(trial.params[p.key]) for p in self.parameters if p.key in trial.params}
 
     def overrides(self, values: Mapping[str, Any]) -> list[str]:

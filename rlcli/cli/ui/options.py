@@ -226,7 +226,9 @@ def _with_strict_number(parameter: inspect.Parameter) -> inspect.Parameter:
 def budget_keys(
     max_iterations: int | None, max_steps: int | None, until: str | None = None, max_minutes: float | None = None
 ) -> dict[str, Any]:
-    """Return the options that end a training as overrides of the agent, without those that are None: key -> value.
+    """Return the options that end a training, such as --max-steps, as values of the agent's settings, by key.
+
+    Options that are None are left out.
 
     If the user has set one of --max-iterations and --max-steps, the other becomes None, so that the agent's own budget
     does not end the training first.

@@ -30,7 +30,7 @@ class ArraySpec:
 
 
 def map_tensors(descriptor: int, specs: Mapping[str, ArraySpec]) -> dict[str, Tensor]:
-    """Return name -> tensor in the memory of a shared file, one after the other in the order of `specs`.
+    """Return tensors whose memory is a shared file, by name; they follow one another in the order of `specs`.
 
     Processes that pass the same `specs` get tensors in the same memory.
 

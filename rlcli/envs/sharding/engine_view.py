@@ -124,7 +124,7 @@ class ShardedEngine:
 
 
 def sums(counts: Sequence[Mapping[str, N]]) -> dict[str, N]:
-    """Return name -> sum of the counts of all shards."""
+    """Add up the counts of all shards, name by name."""
     names = dict.fromkeys(name for count in counts for name in count)
     return {name: sum(count.get(name, 0) for count in counts) for name in names}
 
