@@ -1,4 +1,7 @@
-"""Copy of a robot's MJCF for a new task: without ground, lights and keyframes, with names and asset files."""
+"""Copy of a robot's MJCF for a new task, with all names and asset files that the task needs.
+
+Ground, lights and keyframes are removed, because the task defines these itself.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Interface for plugins that bring a trainer (a learning algorithm): `TrainerSpec`."""
+"""Interface for plugins with a trainer (a learning algorithm): the class `TrainerSpec`.
+
+An entry point of the group `rlcli.trainers` names an object of this class.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -1,4 +1,7 @@
-"""Function `make_sb3`: environments of a task for scripts that call Stable-Baselines3 without `rlcli train`."""
+"""Function `make_sb3`, which returns the environments of a task as a Stable-Baselines3 `VecEnv`.
+
+It is for scripts that call Stable-Baselines3 themselves, instead of `rlcli train`.
+"""
 
 from typing import Any
 

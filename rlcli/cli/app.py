@@ -1,4 +1,7 @@
-"""Main function of `rlcli`: builds the commands, and converts errors into messages and exit codes."""
+"""Main function of the command `rlcli`: it builds the typer app, runs a command and returns the exit code.
+
+Exceptions of a command, of a task's code or of a library become error messages with a hint and an exit code.
+"""
 
 from __future__ import annotations
 

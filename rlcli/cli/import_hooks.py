@@ -1,4 +1,7 @@
-"""Import hooks that the command line installs: one checks the memory limit, one protects matplotlib's settings."""
+"""Import hooks that the command line installs: one checks the memory limit, one protects matplotlib's settings.
+
+Python calls them before it imports a module.
+"""
 
 import contextlib
 from collections.abc import Sequence

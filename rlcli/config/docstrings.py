@@ -1,4 +1,7 @@
-"""Reader of the docstrings below the fields of a pydantic model: they become descriptions in its JSON Schema."""
+"""Reader of the strings below the fields of a pydantic model, which document the fields.
+
+They become the descriptions in the JSON Schema, and so in the reference pages and in editors.
+"""
 
 import ast
 import functools

@@ -1,4 +1,7 @@
-"""Reader of the user's settings file."""
+"""Reader of the user's settings file, which has defaults for the command line.
+
+A mistake in the file is reported with its line and column.
+"""
 
 import os
 from typing import Any

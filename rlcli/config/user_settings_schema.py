@@ -1,4 +1,7 @@
-"""Schema of the user's settings file."""
+"""Schema of the user's settings file: folder of runs, loggers, viewer, verbosity, colours, plugins.
+
+`rlcli.config.user_settings` validates the file with it.
+"""
 
 from typing import Annotated, Literal
 

@@ -1,4 +1,7 @@
-"""Torch module that is exported to all file formats: the policy, and the scaling of its action to commands."""
+"""Torch module that is exported to all file formats: the policy, and the conversion of its action to commands.
+
+A command is what the actuators receive: the action, scaled, shifted and clipped.
+"""
 
 import copy
 import math

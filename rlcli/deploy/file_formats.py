@@ -1,4 +1,7 @@
-"""File formats of exported policies (ONNX, torch, numpy): a writer for each, and a reader to check its file."""
+"""Writers of the file formats of exported policies (ONNX, torch, numpy), and readers that check the written files.
+
+`rlcli.deploy.export` calls them.
+"""
 
 import contextlib
 import importlib

@@ -1,4 +1,7 @@
-"""Metadata of an exported file, which a program needs to run the policy: in rlcli's format and in that of mjlab."""
+"""Metadata of an exported file: names, units and scales of its columns, and a description of the environment.
+
+A program needs them to run the policy. ONNX files also have the metadata that programs for mjlab read.
+"""
 
 from collections.abc import Sequence
 from typing import Any

@@ -1,4 +1,7 @@
-"""Export of a policy to one Python file that needs only numpy: the template `deployed/policy.py` with the weights."""
+"""Export of a policy to one Python file that needs only numpy.
+
+The file is the template `deployed/policy.py`, filled with the weights and the metadata.
+"""
 
 import base64
 import io

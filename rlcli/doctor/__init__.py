@@ -1,4 +1,7 @@
-"""Checks of `rlcli doctor`: whether this machine, this installation and every installed plugin work."""
+"""Checks of `rlcli doctor`: whether this machine, this installation and every installed plugin work.
+
+`run_checks` runs them all; the other modules contain the checks, grouped by subject.
+"""
 
 import threading
 from concurrent.futures import ThreadPoolExecutor

@@ -1,1 +1,4 @@
-"""Environments: the environment loop and its two workflows, manager-based and direct."""
+"""Environments: the environment loop, and the two ways to write a task (workflows): manager-based and direct.
+
+Trainers, evaluations and viewers step an environment through the protocol `Environment`.
+"""

@@ -1,4 +1,7 @@
-"""`ArticulationView`: the robots of all environments as tensors, with the method names of OmniIsaacGymEnvs."""
+"""Class `ArticulationView`: the robots of all environments as tensors, with the method names of OmniIsaacGymEnvs.
+
+Direct tasks that were written for OmniIsaacGymEnvs read and set joint states with it.
+"""
 
 from __future__ import annotations
 

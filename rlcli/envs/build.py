@@ -1,4 +1,7 @@
-"""Construction of the simulation of an environment: engine, entities, actuators, sensors, terrain, start state."""
+"""Construction of an environment's simulation: engine, entities, actuators, sensors, terrain, start state.
+
+The constructor of `VecEnv` calls `build_simulation`.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Counters of the environment loop: steps, episodes, and steps in which the conditions of success hold."""
+"""Counters of the environment loop: steps, episodes, and steps in which the conditions of success hold.
+
+`VecEnv` updates them in every step; checkpoints contain them.
+"""
 
 from __future__ import annotations
 

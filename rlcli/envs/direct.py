@@ -1,4 +1,7 @@
-"""Direct workflow: one task class with the hooks and buffers of OmniIsaacGymEnvs."""
+"""Direct workflow: a task is one class with the hooks and buffers of OmniIsaacGymEnvs.
+
+A task derives its class from `DirectTask`; `DirectEnv` is the environment that calls the hooks.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Interface of environments for trainers, evaluations and recorders."""
+"""Protocol `Environment`: the interface of environments for trainers, evaluations and recorders.
+
+Environments in one process (`VecEnv`) and in several processes (`ShardedEnv`) have this interface.
+"""
 
 from __future__ import annotations
 

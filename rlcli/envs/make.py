@@ -1,4 +1,7 @@
-"""Function `make_env`, which builds the environment of a task in this process."""
+"""Function `make_env`, which builds the environment of a task in this process.
+
+The environment class depends on how the task is written: manager-based, direct, or in another framework's format.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Manager-based workflow: each part of the MDP is a list of small terms, which a manager calls."""
+"""Manager-based workflow: a task consists of lists of terms (small functions), and each list has a manager.
+
+`ManagedEnv` is the environment that calls the managers.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Observers of the environment loop. They run at fixed points of each step; most of them only read."""
+"""Base class and registry of observers, which the environment loop calls at fixed points of each step.
+
+Recorders, crash dumps and statistics of evaluations are observers. Most of them only read.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""State of an environment between two steps, as saved in checkpoints, recordings and crash dumps."""
+"""Functions that save and restore the state of an environment between two steps.
+
+Checkpoints, recordings and crash dumps contain this state.
+"""
 
 from __future__ import annotations
 

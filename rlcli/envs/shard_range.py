@@ -1,4 +1,7 @@
-"""Division of a task's environments into shards: consecutive environments that one process steps."""
+"""Division of a task's environments into shards: consecutive environments that one process steps.
+
+With one shard, all environments are in the main process.
+"""
 
 from __future__ import annotations
 

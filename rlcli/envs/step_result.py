@@ -1,4 +1,7 @@
-"""Data classes for the results of an environment step: observations, rewards, ended episodes."""
+"""Data classes for the results of an environment step: observations, rewards, ended episodes.
+
+`StepResult` is for trainers, `StepRecord` for observers; `Episodes` has the episodes that ended in the step.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Hooks that the environment loop calls and the two workflows (manager-based and direct) implement."""
+"""Hooks that the environment loop calls and the two workflows (manager-based and direct) implement.
+
+The class is the abstract base of `VecEnv`.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Comparison of policies in the same episodes of one task: `rlcli eval --compare RUN1 RUN2 ...`."""
+"""Comparison of several policies in the same episodes of one task, for `rlcli eval --compare RUN1 RUN2 ...`.
+
+Differences are computed episode by episode, so that they do not contain the randomness of start states.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Evaluation of a policy: each environment runs a fixed number of episodes, so that short episodes are not favoured."""
+"""Evaluation of a policy over a given number of episodes, with means, rates and their confidence intervals.
+
+Each environment runs a fixed number of episodes, so that short episodes are not favoured.
+"""
 
 import math
 from collections.abc import Callable

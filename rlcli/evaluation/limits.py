@@ -1,4 +1,7 @@
-"""Limits for the metrics of an evaluation, such as `--fail-under success=0.99`; a missed limit fails the command."""
+"""Limits for the metrics of an evaluation, such as `--fail-under success=0.99`.
+
+`rlcli eval` and `rlcli stress` fail with exit code 9 if a limit is missed.
+"""
 
 from __future__ import annotations
 

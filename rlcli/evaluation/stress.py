@@ -1,4 +1,7 @@
-"""Stress test: evaluation of a policy in many variants of its task, with the same random numbers in each variant."""
+"""Stress test: evaluation of a policy in many variants of its task, such as other masses or delays.
+
+Episodes draw the same random numbers in each variant. `rlcli stress` prints the result.
+"""
 
 import contextlib
 import logging

@@ -1,4 +1,7 @@
-"""Parameters of a stress test and their values on a command line: `body_mass.pole=0.5:2`, `action_delay=0:3`."""
+"""Parameters of a stress test, and the parser of their values on a command line (`body_mass.pole=0.5:2`).
+
+`rlcli.evaluation.perturbations` applies the values to an environment.
+"""
 
 import itertools
 import math

@@ -1,4 +1,7 @@
-"""Lookup of a task by the name or path that the user typed."""
+"""Lookup of a task by the word that the user typed: a name, a folder or a file.
+
+Installed tasks are searched first.
+"""
 
 import os
 from dataclasses import replace

@@ -1,4 +1,7 @@
-"""Lookup of tasks that are not installed: a folder with a YAML file, or a configuration in a Python file or package."""
+"""Lookup of tasks that are not installed: a folder with a YAML file, or a configuration in Python.
+
+`rlcli.registry.find` calls it for the path of a folder or file.
+"""
 
 import ast
 import os

@@ -1,4 +1,7 @@
-"""Lookup of the tasks of installed packages and their files, and of modules that a configuration may name."""
+"""Lookup of the tasks of installed packages and their files, and of modules that a configuration may name.
+
+Packages are located without importing them where possible.
+"""
 
 import importlib.util
 from importlib.machinery import ModuleSpec

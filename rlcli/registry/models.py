@@ -1,4 +1,7 @@
-"""Lookup of a robot's model file (MJCF) in a task's folder, in an installed package, or in a folder of the user."""
+"""Lookup of a robot's model file (MJCF) in a task's folder, in an installed package, or in a folder of the user.
+
+A task file names a model as `FILE`, `TASK:FILE`, `package:PACKAGE/FILE` or `models:FILE`.
+"""
 
 import contextlib
 import os

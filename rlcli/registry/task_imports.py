@@ -1,4 +1,7 @@
-"""Import of the Python files of tasks, by module name or by path."""
+"""Import of the Python files of tasks, by module name or by path.
+
+Files of different tasks with the same name, such as `task.py`, become different modules.
+"""
 
 import contextlib
 import hashlib

@@ -1,4 +1,7 @@
-"""Location of a task: the files and modules from which it is read, checked and built."""
+"""Data class `TaskSource`, the location of a task: the files and modules from which it is read, checked and built.
+
+The registry returns it for a task's name; the configuration and the environment are built from it.
+"""
 
 from dataclasses import dataclass
 from pathlib import Path

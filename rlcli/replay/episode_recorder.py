@@ -1,4 +1,7 @@
-"""Recorder of whole episodes of an evaluation (`rlcli eval --record`), which `rlcli replay` can simulate again."""
+"""Recorder of whole episodes, for `rlcli eval --record` and `rlcli play --record`.
+
+`rlcli replay` can simulate the recorded episodes again.
+"""
 
 from collections.abc import Mapping
 from pathlib import Path

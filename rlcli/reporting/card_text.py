@@ -1,4 +1,7 @@
-"""Short texts for values of a task's configuration, such as noise and ranges, in the tables of a task card."""
+"""Short texts for values of a task's configuration, such as noise and ranges, in the tables of a task card.
+
+A task card describes a task's Markov decision process, see `rlcli.reporting.task_card`.
+"""
 
 from collections.abc import Mapping
 from typing import Any

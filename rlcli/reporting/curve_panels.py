@@ -1,4 +1,7 @@
-"""Choice of the panels in a picture of learning curves: one panel for each metric, and one for all terminations."""
+"""Choice of the panels in a picture of learning curves: one panel for each metric, and one for all terminations.
+
+`rlcli plot` and the report of a run draw these panels.
+"""
 
 import difflib
 from collections.abc import Iterable, Sequence

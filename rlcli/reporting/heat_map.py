@@ -1,4 +1,7 @@
-"""Heat map of `rlcli stress`: a metric of the policy for each pair of values of two varied parameters."""
+"""Heat map of `rlcli stress`: a metric of the policy for each pair of values of two varied parameters.
+
+The colours of all maps of a stress test have the same scale.
+"""
 
 import io
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,7 @@
-"""Renderer of the HTML page of `rlcli report`: one file without scripts or external resources, with escaped text."""
+"""Renderer of the HTML page of `rlcli report`: one file without scripts or external resources, with escaped text.
+
+The content comes from `rlcli.reporting.run_page_content`.
+"""
 
 import base64
 import functools

@@ -1,4 +1,7 @@
-"""Plots of panels of learning curves with matplotlib: without a window, and with equal bytes for equal curves."""
+"""Plots of learning curves and of the trials of a sweep with matplotlib, without a window.
+
+Equal curves give equal bytes, so that files can be compared.
+"""
 
 import importlib.util
 import io

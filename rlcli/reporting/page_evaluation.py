@@ -1,4 +1,7 @@
-"""Evaluation and video for the HTML report of a run: read from the run's folder, or made if they are missing."""
+"""Evaluation and video for the HTML report of a run.
+
+Both are read from the run's folder; if they are missing, the policy is evaluated and filmed now.
+"""
 
 import logging
 from functools import cached_property

@@ -1,4 +1,7 @@
-"""Content of the page of `rlcli report`, read from a run's files; what cannot be read is left out with a reason."""
+"""Content of the HTML page of `rlcli report`, read from the files of a run.
+
+A part that cannot be read is left out, with a reason on the page.
+"""
 
 import contextlib
 import json

@@ -1,1 +1,4 @@
-"""The learning side of rlcli: policies, networks, and the trainers `ppo` (built in) and `sb3` (Stable-Baselines3)."""
+"""Policies, neural networks, and the trainers `ppo` (built in) and `sb3` (Stable-Baselines3).
+
+The training loop in `rlcli.training` calls a trainer; evaluations and viewers call policies.
+"""

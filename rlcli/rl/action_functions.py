@@ -1,4 +1,7 @@
-"""Action functions for an environment: a trained policy with its hidden state, zero actions, random actions."""
+"""Action functions, which map observations to actions: a trained policy, zero actions, or random actions.
+
+Evaluations and viewers act with them. That of a trained policy also keeps its hidden state.
+"""
 
 from __future__ import annotations
 

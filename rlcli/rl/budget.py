@@ -1,4 +1,7 @@
-"""Budget of a training: a limit of iterations, of environment steps, or both."""
+"""Budget of a training: a limit of iterations, of environment steps, or both.
+
+The training loop ends when it is spent; schedules such as that of the learning rate follow it.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""CNN over the images of an observation. Its features replace the columns of the images."""
+"""Convolutional neural network over the images of an observation, for actor, critic and saved policies.
+
+Its features replace the columns of the images; other columns stay as they are.
+"""
 
 from __future__ import annotations
 

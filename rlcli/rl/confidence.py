@@ -1,4 +1,7 @@
-"""95 % confidence intervals of rates, means and comparisons of finished episodes."""
+"""95 % confidence intervals of rates, means and comparisons of finished episodes.
+
+Evaluations print them, and `--until` ends a training by them.
+"""
 
 from __future__ import annotations
 

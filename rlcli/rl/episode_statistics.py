@@ -1,4 +1,7 @@
-"""Statistics of finished episodes, with the metric names of RSL-RL, so that its dashboards can be used."""
+"""Statistics of the episodes that finish during a training: returns, lengths, terminations, success.
+
+The names of the metrics are those of RSL-RL, so that its dashboards can be used.
+"""
 
 from __future__ import annotations
 

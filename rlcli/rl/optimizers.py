@@ -1,4 +1,7 @@
-"""Saving and loading of optimisers' states as named tensors of a checkpoint, and an Adam that imports fast."""
+"""Functions that save and load the state of an optimiser as named tensors, and an Adam that imports fast.
+
+Trainers call them for checkpoints.
+"""
 
 from __future__ import annotations
 

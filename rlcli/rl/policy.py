@@ -1,4 +1,7 @@
-"""Policy as it is saved, played and exported: a network from raw observations to the actions of `env.step`."""
+"""Policy as it is saved, played and exported: a network from raw observations to the actions of `env.step`.
+
+It includes the normalisation of observations. In training, trainers use faster networks with the same weights.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Seeds and states of the global random generators of torch, numpy and Python."""
+"""Functions that seed, save and restore the global random generators of torch, numpy and Python.
+
+Trainers save the states in checkpoints; evaluations restore them, so that a training is not changed.
+"""
 
 from __future__ import annotations
 

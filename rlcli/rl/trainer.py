@@ -1,4 +1,7 @@
-"""Protocol between the training loop and a trainer, and the data that they exchange."""
+"""Protocol `Trainer`, through which the training loop calls a trainer, and the data that they exchange.
+
+Every trainer, built in or from a plugin, has this interface.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Base class of trainers, and helpers that trainers of all libraries share."""
+"""Base class `BaseTrainer` of all trainers, and helpers that trainers share.
+
+It keeps episode statistics and the newest observations, and makes the report of an iteration.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Atomic writing of files: after a crash a reader finds either the old content or the new one."""
+"""Atomic writing of files: after a crash a reader finds either the old content or the new one.
+
+The files of runs, exports and reports are written with it. Errors of the disk get a hint.
+"""
 
 import contextlib
 import errno

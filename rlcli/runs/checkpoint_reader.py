@@ -1,4 +1,7 @@
-"""Reader of checkpoints: folders of safetensors and JSON files; hashes are checked, and nothing is unpickled."""
+"""Reader of checkpoints, which are folders of safetensors and JSON files.
+
+Sizes and hashes are checked, and nothing is unpickled, because a checkpoint may be untrusted.
+"""
 
 import hashlib
 from dataclasses import dataclass

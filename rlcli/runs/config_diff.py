@@ -1,4 +1,7 @@
-"""Comparison of two configurations, with a category for each difference: physics, MDP, agent or cosmetic."""
+"""Comparison of two configurations, with a category for each difference: physics, MDP, agent or cosmetic.
+
+`rlcli diff` and the report of a run use it.
+"""
 
 from __future__ import annotations
 

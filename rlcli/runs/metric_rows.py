@@ -1,4 +1,7 @@
-"""Reader of a run's `metrics.jsonl`, which has one row for each iteration."""
+"""Reader of the file `metrics.jsonl` of a run, which has one row of metrics for each iteration.
+
+The file may be untrusted, and a killed process may leave an incomplete last row.
+"""
 
 import json
 import logging

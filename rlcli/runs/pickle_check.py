@@ -1,4 +1,7 @@
-"""Check of the pickle in a .pt file before torch reads it: simulates the pickle's operations without executing them."""
+"""Check of the pickle in a .pt file before torch reads it.
+
+It simulates the operations of the pickle without executing them, and refuses all that could run code.
+"""
 
 import pickletools
 from collections.abc import Iterable

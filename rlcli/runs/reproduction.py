@@ -1,4 +1,7 @@
-"""Functions of `rlcli reproduce`, which trains a run again: checks before the training, and the new run's folder."""
+"""Functions for `rlcli reproduce`, which trains a run again and compares the results.
+
+They check that the run can be reproduced, and create the folder of the new run.
+"""
 
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,4 +1,7 @@
-"""Class `Run`, the folder of one training with configuration, record (run.json) and checkpoints; it can be locked."""
+"""Class `Run`, the folder of one training, with configuration, record (run.json), metrics and checkpoints.
+
+The process that writes to a run locks it. Content of a downloaded run is untrusted and is checked.
+"""
 
 import contextlib
 import errno

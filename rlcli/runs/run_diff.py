@@ -1,4 +1,7 @@
-"""Comparison of two runs from their files: configuration, environment, metrics, weights and policy."""
+"""Comparison of two runs by their files: configuration, environment, metrics, weights and policy.
+
+`rlcli diff` and `rlcli reproduce` print the result.
+"""
 
 from __future__ import annotations
 

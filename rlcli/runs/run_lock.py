@@ -1,4 +1,7 @@
-"""Lock of a run's folder: only the process that holds the lock may write there, and each write checks the lock."""
+"""Lock of a run's folder: only the process that holds the lock may write there.
+
+Each write checks the lock first, because the folder may have been deleted or moved.
+"""
 
 import os
 import stat

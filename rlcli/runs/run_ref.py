@@ -1,4 +1,7 @@
-"""Search for the run or checkpoint that a command line names: a folder, a name, `latest`, RUN@best or RUN@step:N."""
+"""Search for the run or checkpoint that a command line names.
+
+The name is a folder, the name of a run, `latest`, `RUN@best` or `RUN@step:N`.
+"""
 
 import glob
 import logging

@@ -1,4 +1,7 @@
-"""Safe reading of untrusted files, such as those of a downloaded run: limited size, strict JSON, checked content."""
+"""Safe reading of untrusted files, such as those of a downloaded run.
+
+Sizes are limited, links and pipes are refused, and JSON is parsed strictly and validated with pydantic models.
+"""
 
 import contextlib
 import errno

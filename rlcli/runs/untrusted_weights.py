@@ -1,4 +1,7 @@
-"""Safe reading of models saved by torch and Stable-Baselines3: only tensors and plain data are unpickled."""
+"""Safe reading of model files that torch and Stable-Baselines3 have written.
+
+Only tensors and plain data are unpickled. `rlcli import` reads policies with it.
+"""
 
 import io
 import re

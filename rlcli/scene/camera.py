@@ -1,4 +1,7 @@
-"""Camera sensors: images of every environment, rendered offscreen by threads with one OpenGL context each."""
+"""Camera sensors: images of every environment, rendered without a window.
+
+Several threads render in parallel, each with its own OpenGL context.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Entity: a robot or object of the scene, its elements by name, and setters of its state."""
+"""Class `Entity`: a robot or object of the scene, with its elements by name and methods that set its state.
+
+Terms and direct tasks receive entities; `entity.data` has their state.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""State of an entity as terms read it: joints, root, gravity, bodies and sites, in every environment."""
+"""Class `EntityData`, the state of a robot or object as terms read it: joints, root, gravity, bodies, sites."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Model (MjSpec) of one robot or object before it is attached to a scene: its MJCF, or a single shape."""
+"""Model (MjSpec) of one robot or object before it is attached to the scene.
+
+It comes from an MJCF file, which is checked before MuJoCo opens it, or is a single shape.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Ground plane, ground material, sky and lights of a scene."""
+"""Functions that add ground plane, ground material, sky and lights to the model of a scene.
+
+`rlcli.scene.scene` calls them.
+"""
 
 from __future__ import annotations
 

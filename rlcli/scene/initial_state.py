@@ -1,4 +1,7 @@
-"""Default state of an entity, to which resets return: its joints and its root, from the MJCF and the configuration."""
+"""Default state of an entity, to which resets return: positions and velocities of joints and root.
+
+It comes from the MJCF and from the configuration (`init`, `pos`, `quat`).
+"""
 
 from __future__ import annotations
 

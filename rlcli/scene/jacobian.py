@@ -1,4 +1,7 @@
-"""Geometric Jacobian of a body of an entity, from the joints' axes and anchors in the world."""
+"""Geometric Jacobian of a body with respect to the joints of its entity.
+
+It is computed from the joints' axes and anchors in the world; action terms for inverse kinematics use it.
+"""
 
 from __future__ import annotations
 

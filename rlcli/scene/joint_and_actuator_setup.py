@@ -1,4 +1,7 @@
-"""Joints and actuators of a scene's model: joint settings of the configuration, and actuators that the MJCF lacks."""
+"""Writer of joint settings and actuators into the model of a scene, before it is compiled.
+
+It applies the section `joints` of an entity, and adds actuators that terms need and the MJCF lacks.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Check of an MJCF's joint limits for a wrong unit of angles: degrees read as radians, or radians read as degrees."""
+"""Check of an MJCF's joint limits for a wrong unit of angles: degrees read as radians, or radians read as degrees.
+
+`rlcli new --robot` and the linter warn about such files.
+"""
 
 from __future__ import annotations
 

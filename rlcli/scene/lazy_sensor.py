@@ -1,4 +1,7 @@
-"""Base class of sensors that are computed when they are read."""
+"""Base class of sensors whose values are computed only when a term reads them.
+
+Ray sensors and cameras derive from it.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Estimate of the cost (time and memory) of compiling an untrusted MJCF; an ordinary element costs 1."""
+"""Estimate of the cost (time and memory) of compiling an untrusted MJCF; an ordinary element costs 1.
+
+`mjcf_safety_check` adds up the costs, and refuses a model that is too expensive.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Check of an untrusted MJCF before MuJoCo opens it: the files that it loads, and the cost of compiling it."""
+"""Check of an untrusted MJCF before MuJoCo opens it.
+
+It parses the XML, checks the files that the model loads, and estimates the cost of compiling it.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Fields of MjModel, such as body_mass, whose values may differ between environments (domain randomization)."""
+"""Access to the fields of MjModel, such as body_mass, whose values may differ between environments.
+
+Events for domain randomization and stress tests write to them.
+"""
 
 from __future__ import annotations
 

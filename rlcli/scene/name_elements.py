@@ -1,4 +1,7 @@
-"""Names for all elements of a model. The subprocess that compiles untrusted models imports this module, too."""
+"""Function that names all elements of a model which have no name.
+
+The scene uses it, and so does the subprocess that compiles untrusted models.
+"""
 
 import mujoco
 

@@ -1,4 +1,7 @@
-"""Search for the elements of a model (joints, bodies, ...) whose names match a name or regular expression."""
+"""Search for the elements of a model (joints, bodies, ...) whose names match a name or regular expression.
+
+The time of a regular expression is limited, because it may come from an untrusted task.
+"""
 
 from __future__ import annotations
 

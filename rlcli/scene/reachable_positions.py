@@ -1,4 +1,7 @@
-"""Random poses of a robot, and the positions that one of its bodies reaches in them, by forward kinematics."""
+"""Random poses of a robot, and the positions that one of its bodies reaches in them, by forward kinematics.
+
+Commands sample reachable goals from these positions.
+"""
 
 from __future__ import annotations
 

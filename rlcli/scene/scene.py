@@ -1,4 +1,7 @@
-"""Construction of a scene: from its configuration to a compiled MuJoCo model."""
+"""Class `Scene`: construction of a task's MuJoCo model from its configuration.
+
+It attaches robots and objects, adds ground, lights, sensors and terrain, and compiles the model.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Contact sensors and ray sensors of a scene, whose readings are (num_envs, ...) tensors."""
+"""Contact sensors and ray sensors of a scene; a reading is a tensor with one row for each environment.
+
+Terms read them by the names in the section `scene.sensors`.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Terrain of a scene: patches joined in the model, and the start position of each environment on it."""
+"""Terrain of a scene: generated patches joined in the model, and the start position of each environment.
+
+Curriculum terms move environments to harder patches with it.
+"""
 
 from __future__ import annotations
 

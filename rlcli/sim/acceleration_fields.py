@@ -1,4 +1,7 @@
-"""Lists of the MjData fields and sensors that MuJoCo computes in the last stage of a step: forces, accelerations."""
+"""Lists of the MjData fields and sensors that MuJoCo computes in the last stage of a step: forces, accelerations.
+
+Steps compute some of them only if a sensor needs them, so terms that read them add a sensor.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""CPU engine on `mujoco.batch.Batch`, a C++ thread pool; results are bit-identical for any number of threads."""
+"""CPU engine on `mujoco.batch.Batch`, a thread pool in C++ that steps many worlds (simulations).
+
+Results are bit-identical for any number of threads.
+"""
 
 from __future__ import annotations
 

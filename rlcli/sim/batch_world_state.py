@@ -1,4 +1,7 @@
-"""Worlds of the CPU engine (one per environment): model fields that differ between worlds, and integration states."""
+"""Base class of the CPU engine that holds its worlds (one per environment) and their states.
+
+It also gives worlds their own values of model fields, for domain randomization.
+"""
 
 from __future__ import annotations
 

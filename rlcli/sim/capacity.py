@@ -1,4 +1,7 @@
-"""Estimate of the contacts and constraints of a world, for which MuJoCo Warp allocates memory in advance."""
+"""Estimate of the largest numbers of contacts and constraints in a world.
+
+MuJoCo Warp, the GPU engine, allocates memory for them in advance.
+"""
 
 from __future__ import annotations
 

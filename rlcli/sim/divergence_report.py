@@ -1,4 +1,7 @@
-"""Description of diverged simulations: the cause, and the recorded engine calls before the divergence."""
+"""Description of diverged simulations: the cause, and the recorded engine calls before the divergence.
+
+The engines create the descriptions; logs and crash dumps show them.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Protocol of engines: an engine steps many worlds of one model, one for each environment, on a CPU or a GPU."""
+"""Protocol of physics engines, which step many worlds (simulations) of one model, one for each environment.
+
+`open_engine` returns the engine for a device: on a CPU or on a GPU.
+"""
 
 from __future__ import annotations
 

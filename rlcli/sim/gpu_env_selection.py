@@ -1,4 +1,7 @@
-"""Selection as a mask over all environments, which a GPU can use without a host sync."""
+"""Class `MaskSelection`: a subset of the environments as a mask, for the GPU engine.
+
+Unlike a list of indices, a mask needs no host sync (the CPU does not wait for the GPU).
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Function that turns off MuJoCo's log file and its warnings on the terminal."""
+"""Function that turns off MuJoCo's log file and its warnings on the terminal.
+
+The engines read MuJoCo's warning counters instead.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Base class for objects whose state is saved as named tensors, and checks of saved tensors before their use."""
+"""Base class for objects whose state is saved as named tensors, and checks of saved tensors before their use.
+
+Managers, sensors and engines save their state in checkpoints with it.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Fields of MjData in the GPU engine: fields of the state, and the stages of a step that compute all other fields."""
+"""Table of the fields of MjData in the GPU engine, with the stage of a step that computes each of them.
+
+The engine computes only the stages whose fields a task reads.
+"""
 
 from __future__ import annotations
 

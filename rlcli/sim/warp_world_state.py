@@ -1,4 +1,7 @@
-"""Worlds of the GPU engine (one per environment): model fields that differ between worlds, fields of MjData, states."""
+"""Base class of the GPU engine that holds its worlds (one per environment) and their states.
+
+It also gives worlds their own values of model fields, for domain randomization.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Rules of the linter for angles that are probably in degrees, or radians that are read as degrees."""
+"""Rules of the linter for angles that are probably in degrees, or radians that are read as degrees.
+
+They are part of `rlcli lint`.
+"""
 
 from __future__ import annotations
 

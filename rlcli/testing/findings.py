@@ -1,4 +1,7 @@
-"""Findings of the contract checks, and the exception of a check that does not apply."""
+"""Data class `Finding`, the result of a check of `rlcli check`, and the exception of a check that does not apply.
+
+A check yields a finding for each violation of its rule.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Fixed policies (zero, random, bang-bang, sine) and their recorded rollouts, which the linter checks."""
+"""Fixed policies (zero, random, bang-bang, sine) and their recorded rollouts, which the linter checks.
+
+The policies need no training, so the linter can judge a task before any training.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Detection of host syncs: operations of torch for which the CPU (host) must wait until a GPU has computed a value."""
+"""Detection of host syncs: operations of torch for which the CPU (host) must wait until a GPU has computed a value.
+
+The check of `rlcli check` for GPUs uses it on a CPU.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Rules of the linter: each finds one obstacle to learning in the recorded rollouts of fixed policies."""
+"""Rules of `rlcli lint`: each finds one obstacle to learning in the recorded rollouts of fixed policies.
+
+A rule yields remarks; `RULES` has all rules by name.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Class `TaskUnderTest`: a task with small seeded environments, and one recording that several checks share."""
+"""Class `TaskUnderTest`: a task with small seeded environments, and one recording that several checks share.
+
+The checks and the linter get the task in this form.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Measurement of the energy error of a physics time step, by comparison with half of that step."""
+"""Measurement of the energy error of a physics time step, by comparison with half of that step.
+
+The lint rule `timestep` reports steps that are too long.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Health checks of a training: they read the metrics of its iterations and report what may prevent learning."""
+"""Health checks of a training: they read its metrics and report what may prevent learning.
+
+The training loop runs them about 40 times; findings are logged and written into run.json.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Import of policies saved by Stable-Baselines3 or RSL-RL: the weights become a run with one checkpoint."""
+"""Import of policies that Stable-Baselines3 or RSL-RL has saved, for `rlcli import`.
+
+The weights become a run with one checkpoint, which can be played, evaluated and exported.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Data classes for the start (`Job`) and the result of a training. The module imports neither torch nor MuJoCo."""
+"""Data classes `Job`, a training to start, and `TrainingResult`, the result of a finished training.
+
+The module imports neither torch nor MuJoCo.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Loggers of metrics: `metrics.jsonl` always, TensorBoard if it is installed, and trackers if the user names them."""
+"""Loggers, which write the metrics of each iteration of a training.
+
+`metrics.jsonl` is always written, TensorBoard if it is installed, experiment trackers if the user names them.
+"""
 
 from __future__ import annotations
 

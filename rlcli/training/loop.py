@@ -1,4 +1,7 @@
-"""Training loop: iterate, log, evaluate and save until the budget is spent or a signal arrives."""
+"""Training loop of one run: iterate, log, evaluate and save until the budget is spent or a signal arrives.
+
+`rlcli.training.runner` prepares everything that the loop needs.
+"""
 
 from __future__ import annotations
 

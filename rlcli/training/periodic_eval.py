@@ -1,4 +1,7 @@
-"""Evaluation of the policy every few iterations of a training; its best score marks the best checkpoint."""
+"""Evaluation of the policy every few iterations of a training.
+
+The checkpoint with the best score is RUN@best; a threshold (`--until`) can end the training.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Runner of a training: it opens loggers and checkpoints, runs the loop, and records the end in the run."""
+"""Function `run_training`, which runs a prepared training to its end.
+
+It opens loggers and checkpoints, runs the training loop, and records in run.json how the training ended.
+"""
 
 from __future__ import annotations
 

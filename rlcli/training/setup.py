@@ -1,4 +1,7 @@
-"""Setup of a training: the environment and the trainer of a job, in the state in which training starts."""
+"""Setup of a training: it builds the environment and the trainer of a job.
+
+For a resumed run it also loads the checkpoint.
+"""
 
 from __future__ import annotations
 

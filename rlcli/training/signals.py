@@ -1,4 +1,7 @@
-"""Signals (Ctrl-C, SIGTERM) that stop a training: the first stops it with a checkpoint, the second at once."""
+"""Signals (Ctrl-C, SIGTERM) that stop a training: the first stops it with a checkpoint, the second at once.
+
+Commands that train use `StopRequest`, a context manager.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Start of a training: create or resume its run on rank 0, and broadcast the job (run and settings) to all ranks."""
+"""Start of a training: the run is created or resumed, and the job (run and settings) is made.
+
+With several processes (ranks), rank 0 does this and broadcasts the job to the others.
+"""
 
 from __future__ import annotations
 

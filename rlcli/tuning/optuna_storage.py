@@ -1,4 +1,7 @@
-"""Storage of a sweep's trials by Optuna: a journal file in the sweep's folder, or a database for several machines."""
+"""Storage of a sweep's trials by the library Optuna.
+
+It is a journal file in the sweep's folder, or a database that several machines share.
+"""
 
 from __future__ import annotations
 

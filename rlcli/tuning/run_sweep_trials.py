@@ -1,4 +1,7 @@
-"""Runner of a sweep's trials: trains, evaluates and prunes them in subprocesses."""
+"""Runner of a sweep's trials: it trains and evaluates each trial in a subprocess.
+
+It also stops (prunes) trials that learn worse than most.
+"""
 
 import logging
 import math

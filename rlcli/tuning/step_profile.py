@@ -1,4 +1,7 @@
-"""Profile of an environment step: the time of each of its stages, and of each term."""
+"""Profile of an environment step: the time of each of its stages, and of each term.
+
+`rlcli bench --profile` prints it.
+"""
 
 from __future__ import annotations
 

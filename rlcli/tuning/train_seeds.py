@@ -1,4 +1,7 @@
-"""Training of one configuration with several seeds (a study), and their aggregated learning curves."""
+"""Training of one configuration with several seeds (a study), for `rlcli train --seeds`.
+
+At the end it writes learning curves that are aggregated over the seeds.
+"""
 
 import logging
 from collections.abc import Callable, Sequence

@@ -1,4 +1,7 @@
-"""Loader of a run's checkpoints for a viewer, which can switch between them while the run is still training."""
+"""Loader of a run's checkpoints for a viewer.
+
+The viewer can switch between checkpoints while the run is still training.
+"""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,7 @@
-"""Drawing of a task's markers (arrows, frames, spheres such as goals) as geoms of a MuJoCo scene, for all viewers."""
+"""Drawing of a task's markers (arrows, frames, spheres such as goals) as geoms of a MuJoCo scene.
+
+All viewers and videos use it.
+"""
 
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple

@@ -1,4 +1,7 @@
-"""Grid of several environments in one image: the shown environment first, then the next ones, with their markers."""
+"""Grid of several environments in one image: the shown environment and those with the next indices.
+
+Viewers and videos draw it, with the markers of each environment.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -1,4 +1,7 @@
-"""History of a playback for the panels of viewers: rewards of the last seconds, returns, and ends of episodes."""
+"""History of rewards and episodes during a playback, for the panels of viewers.
+
+It has the rewards of the last seconds, the returns, and how episodes ended.
+"""
 
 from __future__ import annotations
 

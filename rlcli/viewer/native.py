@@ -1,4 +1,7 @@
-"""Viewer in a window: MuJoCo's own passive viewer."""
+"""Viewer in a window: MuJoCo's own passive viewer, with keyboard controls.
+
+`rlcli play --viewer native` opens it.
+"""
 
 import copy
 import sys

@@ -1,4 +1,7 @@
-"""Rendering of an environment to images without a window, for videos and `render()`."""
+"""Renderer of environments without a window, for videos and for `render()` of Gymnasium environments.
+
+The camera is that of the task's section `viewer`.
+"""
 
 import contextlib
 import math

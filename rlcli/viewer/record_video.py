@@ -1,4 +1,7 @@
-"""Functions that write a video of one episode: of a policy that acts, of a recording, or of a failure case."""
+"""Functions that write a video of one episode.
+
+The episode is played by a policy, read from a recording, or read from a failure case of a training.
+"""
 
 import contextlib
 from collections.abc import Callable, Iterable, Iterator

@@ -1,4 +1,7 @@
-"""Writer of video files. Importing the module is fast, so that commands can refuse a wrong file name at once."""
+"""Writer of video files (.mp4, .gif), and checks that they can be written.
+
+Importing the module is fast, so that commands can refuse a wrong file name at once.
+"""
 
 from __future__ import annotations
 

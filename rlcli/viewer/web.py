@@ -1,4 +1,7 @@
-"""Viewer in the browser; it uses MuJoCo's own web viewer, with access control."""
+"""Viewer in the browser, which uses MuJoCo's own web viewer with access control.
+
+`rlcli play --viewer web` opens it.
+"""
 
 import contextlib
 import copy

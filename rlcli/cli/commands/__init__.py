@@ -1,1 +1,4 @@
-"""Commands of `rlcli`, one module each: it declares the options, calls the library, and prints the result."""
+"""Commands of `rlcli`, one module for each.
+
+A module declares the options of its command, calls the library, and prints the result.
+"""

@@ -1,4 +1,7 @@
-"""`rlcli autopsy`: show the episodes that a training recorded because they failed or were outliers."""
+"""Command `rlcli autopsy`: list and inspection of the failed and outlier episodes that a training recorded.
+
+It reads the recordings in the folder of the run, and can render one of them as a video.
+"""
 
 from __future__ import annotations
 

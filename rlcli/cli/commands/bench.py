@@ -1,4 +1,7 @@
-"""`rlcli bench`: measurement of a task's speed on this machine, to find the settings with the fastest iterations."""
+"""Command `rlcli bench`: measurement of a task's speed on this machine.
+
+It recommends numbers of environments, threads and worker processes, and can write them to a file for `--config`.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""`rlcli check`: tests that a task keeps rlcli's rules for shapes, seeds, resets, rewards and devices."""
+"""Command `rlcli check`: tests that a task keeps rlcli's rules for shapes, seeds, resets, rewards and devices.
+
+The checks themselves are in `rlcli.testing`; this module prints their findings.
+"""
 
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated

@@ -1,4 +1,7 @@
-"""`rlcli diff`: comparison of two runs (where they differ first) or of two configurations (all differences)."""
+"""Command `rlcli diff`: comparison of two runs or of two configurations.
+
+For runs it prints where they differ first, for configurations all differences.
+"""
 
 from __future__ import annotations
 

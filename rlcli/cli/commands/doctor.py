@@ -1,4 +1,7 @@
-"""`rlcli doctor`: checks of the machine, the installation and the plugins."""
+"""Command `rlcli doctor`: checks of the machine, the installation and the plugins.
+
+The checks themselves are in `rlcli.doctor`; this module prints their results as a table.
+"""
 
 from dataclasses import asdict
 

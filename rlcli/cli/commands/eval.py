@@ -1,4 +1,7 @@
-"""`rlcli eval`: evaluation of a policy with confidence intervals and limits, or comparison of several."""
+"""Command `rlcli eval`: evaluation of a policy over many episodes, or comparison of several policies.
+
+It prints means and rates with confidence intervals, and fails if a limit such as `--fail-under` is missed.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""`rlcli export`: write a trained policy as one file for a robot, and verify the file in plain MuJoCo."""
+"""Command `rlcli export`: a trained policy as one file that runs on a robot without rlcli.
+
+With --verify the file also controls the robot in plain MuJoCo, and the result is compared with an evaluation.
+"""
 
 from __future__ import annotations
 

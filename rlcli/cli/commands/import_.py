@@ -1,4 +1,7 @@
-"""`rlcli import`: conversion of a task or a policy of another framework."""
+"""Command `rlcli import`: conversion of a task or a trained policy of another framework.
+
+The policies of Stable-Baselines3 and RSL-RL are built in; plugins add the conversion of task files.
+"""
 
 from __future__ import annotations
 

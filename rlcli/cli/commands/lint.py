@@ -1,4 +1,4 @@
-"""`rlcli lint`: search for properties of a task that make it hard to learn.
+"""Command `rlcli lint`: search for properties of a task that make it hard to learn.
 
 The linter runs simple fixed policies (zero, random, bang-bang, sine) and checks their rollouts with one rule for each
 obstacle. `rlcli.testing.lint_rules.RULES` contains all rules.

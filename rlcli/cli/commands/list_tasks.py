@@ -1,4 +1,7 @@
-"""`rlcli list-tasks`: the installed tasks, from package metadata and a cache; imports no plugin in this process."""
+"""Command `rlcli list-tasks`: table of the installed tasks.
+
+Names come from package metadata, details from a cache. Plugins are imported only in other processes.
+"""
 
 from collections import Counter
 from typing import Annotated, Any

@@ -1,4 +1,7 @@
-"""`rlcli new`: an installable package with a new task."""
+"""Command `rlcli new`: generator of an installable package with a new task.
+
+The files are written by `rlcli.scaffold`; for the robot of an MJCF, `rlcli.scaffold_robot` designs the task.
+"""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated

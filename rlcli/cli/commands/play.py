@@ -1,4 +1,7 @@
-"""`rlcli play`: a policy in a window, in the browser, as a video, or as printed values."""
+"""Command `rlcli play`: a policy that acts in a window, in the browser, in a video, or as printed values.
+
+It can also repeat one episode of an evaluation, and record episodes to a file.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""`rlcli plot`: picture with learning curves; runs that differ only in their seed become one curve."""
+"""Command `rlcli plot`: picture with the learning curves of runs.
+
+Runs that differ only in their seed become one curve, with a confidence interval.
+"""
 
 from __future__ import annotations
 

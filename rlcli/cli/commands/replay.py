@@ -1,4 +1,7 @@
-"""`rlcli replay`: simulate a recording, crash dump or failure case again and compare it bit by bit."""
+"""Command `rlcli replay`: repetition of recorded simulation steps, with a comparison bit by bit.
+
+The steps are in a recording of episodes, in the dump of a diverged simulation, or in a failure case of a training.
+"""
 
 from __future__ import annotations
 

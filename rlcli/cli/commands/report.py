@@ -1,4 +1,7 @@
-"""`rlcli report`: one self-contained HTML page about a run."""
+"""Command `rlcli report`: one self-contained HTML page about a run.
+
+The page has task, learning curves, evaluation, video, configuration and machine.
+"""
 
 from __future__ import annotations
 

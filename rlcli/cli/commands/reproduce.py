@@ -1,4 +1,4 @@
-"""`rlcli reproduce`: repetition of a training, whose metrics and weights must equal those of the original run.
+"""Command `rlcli reproduce`: repetition of a training, whose metrics and weights must equal those of the original run.
 
 First the command compares the versions of software and the machine with those that the run has recorded.
 """

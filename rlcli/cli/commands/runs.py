@@ -1,4 +1,7 @@
-"""`rlcli runs`: the runs of a folder with their state and score."""
+"""Command `rlcli runs`: table of the runs in a folder, with their state, progress and score.
+
+The values are read from the files of the runs; thousands of runs take little time.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""`rlcli show`: printout of a task's resolved configuration, of the origin of each value, or of the JSON Schema."""
+"""Command `rlcli show`: printout of a task's resolved configuration.
+
+It can also print the origin of each value (file and line, or option), or the JSON Schema of a task file.
+"""
 
 import json as json_module
 from typing import Annotated

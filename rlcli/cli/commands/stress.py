@@ -1,4 +1,7 @@
-"""`rlcli stress`: evaluation of a policy with changed masses, frictions, delays and other parameters."""
+"""Command `rlcli stress`: evaluation of a policy with changed masses, frictions, delays and other parameters.
+
+It prints a table and a heat map of the success rate or return, and fails if a minimum is missed.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""`rlcli sweep`: hyperparameter search in trials; several processes with the same command share the trials."""
+"""Command `rlcli sweep`: search for good settings of an agent (hyperparameter search) by many trainings, called trials.
+
+Several processes that run the same command share the trials.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""`rlcli terms [PATTERN]`: the terms (observation, action, reward, event ... functions) that a task file can use."""
+"""Command `rlcli terms`: list of the terms that a task file can use, with their keys, types and defaults.
+
+A term is a function for an observation, an action, a reward, a termination, an event and so on.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""`rlcli train`: train a policy, or several with other seeds; start a new run or resume one."""
+"""Command `rlcli train`: training of a policy, or of several policies with different seeds.
+
+It starts a new run or resumes one, and shows the progress.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""`rlcli validate`: check the configuration of a task, and with `--deep` its model."""
+"""Command `rlcli validate`: check of a task's configuration, which reports all mistakes at once.
+
+With --deep it also compiles the model and looks up all names of joints, bodies and sensors in it.
+"""
 
 from typing import Annotated
 

@@ -1,4 +1,7 @@
-"""`rlcli watch`: live view of a training that runs in another terminal; reads only the files of its run."""
+"""Command `rlcli watch`: live view of a training that runs in another terminal.
+
+It reads only the files of the run, so it cannot disturb the training.
+"""
 
 from __future__ import annotations
 

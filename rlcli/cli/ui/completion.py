@@ -1,4 +1,7 @@
-"""Functions that complete words of a command line when the user presses Tab; they are fast: no plugin is imported."""
+"""Functions that complete words of a command line when the user presses Tab: tasks, runs, checkpoints, agents.
+
+The options of commands name them as their completion. They are fast, because no plugin is imported.
+"""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path

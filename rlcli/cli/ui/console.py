@@ -1,4 +1,7 @@
-"""Output of commands: data on stdout, messages on stderr, one JSON document with `--json`."""
+"""Writer for the output of all commands: data on stdout, messages on stderr, one JSON document with --json.
+
+It escapes control characters in texts, because these may come from untrusted files.
+"""
 
 from __future__ import annotations
 

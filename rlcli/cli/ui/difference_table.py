@@ -1,4 +1,7 @@
-"""Table of the differences of two runs or configurations."""
+"""Table of the differences of two runs or configurations, for `rlcli diff` and `rlcli reproduce`.
+
+The differences are grouped by kind: physics, MDP, agent, cosmetic.
+"""
 
 from __future__ import annotations
 

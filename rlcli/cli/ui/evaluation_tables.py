@@ -1,4 +1,7 @@
-"""Tables of evaluations, comparisons and stress tests."""
+"""Tables with the results of evaluations, comparisons and stress tests, for `rlcli eval`, `play` and `stress`.
+
+Means and rates have 95 % confidence intervals.
+"""
 
 from __future__ import annotations
 

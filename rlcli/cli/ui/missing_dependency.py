@@ -1,4 +1,7 @@
-"""Conversion of a failed import into an error with the pip command that installs the missing dependency."""
+"""Conversion of a failed import into an error with the pip command that installs the missing package.
+
+The main function uses it for the optional dependencies of rlcli.
+"""
 
 import re
 from importlib import metadata

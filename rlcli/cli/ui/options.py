@@ -1,4 +1,7 @@
-"""Options that several commands share, so that a flag means the same everywhere."""
+"""Declarations of options that several commands share, so that a flag means the same everywhere.
+
+`add_command` adds a command with the common options, such as --json, and with the help of its docstring.
+"""
 
 import functools
 import inspect
@@ -228,10 +231,8 @@ def budget_keys(
 ) -> dict[str, Any]:
     """Return the options that end a training, such as --max-steps, as values of the agent's settings, by key.
 
-    Options that are None are left out.
-
-    If the user has set one of --max-iterations and --max-steps, the other becomes None, so that the agent's own budget
-    does not end the training first.
+    Options that the user has not given are left out. Exception: if only one of --max-iterations and --max-steps is
+    given, the other is None in the result, so that the agent's own budget does not end the training first.
     """
     ends = {"agent.until": until, "agent.max_minutes": max_minutes}
     keys: dict[str, Any] = {key: value for key, value in ends.items() if value is not None}

@@ -1,4 +1,7 @@
-"""Version of rich's `Live` display that is drawn correctly after the terminal has been made narrower."""
+"""Version of rich's `Live` display that is drawn correctly after the terminal has been made narrower.
+
+The live views of commands and trainings use it.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Views and tables of several trainings: of a study (one run for each seed), and of a sweep."""
+"""Views and tables of several trainings: of a study (one run for each seed), and of a sweep.
+
+`rlcli train --seeds` and `rlcli sweep` use them.
+"""
 
 import time
 from collections.abc import Sequence

@@ -1,4 +1,7 @@
-"""Tables that fit the width of a terminal: a table that is too wide becomes one block of lines for each row."""
+"""Tables that fit the width of a terminal.
+
+A table that is too wide becomes one block of lines for each row.
+"""
 
 import sys
 from collections.abc import Sequence

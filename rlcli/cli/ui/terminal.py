@@ -1,4 +1,7 @@
-"""Properties of an output stream: whether it is a terminal, its colours and its width."""
+"""Properties of an output stream: whether it is a terminal, its colours and its width.
+
+The console and the tables use them to decide whether to print colours and to redraw lines.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Schema of the settings of an agent that all trainers share."""
+"""Schema of the settings of an agent that all trainers share: budget, checkpoints, evaluations.
+
+Each trainer derives the model of its own settings from `AgentConfig`.
+"""
 
 import math
 from typing import Annotated, Any, Self

@@ -1,4 +1,7 @@
-"""Number types and the base class of all configuration models."""
+"""Number types with their allowed ranges, and the base class of all configuration models.
+
+The other modules of the schema use them.
+"""
 
 import math
 import re

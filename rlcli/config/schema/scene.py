@@ -1,4 +1,7 @@
-"""Schema of the scene: ground, lights, robots and objects with their joints and actuators."""
+"""Schema of the section `scene`: ground, lights, robots and objects with their joints and actuators.
+
+`rlcli.scene` builds a MuJoCo model from these settings.
+"""
 
 from typing import Annotated, Literal, Self
 

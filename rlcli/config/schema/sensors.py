@@ -1,4 +1,7 @@
-"""Schema of contact sensors, ray sensors and cameras."""
+"""Schema of the sensors in a scene: contact sensors, ray sensors and cameras.
+
+Sensors of the MJCF need no entry; terms read both kinds.
+"""
 
 from typing import Annotated, Literal, Self
 

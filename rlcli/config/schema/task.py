@@ -1,4 +1,7 @@
-"""Schema of a whole task, of its simulation and of its viewer camera."""
+"""Schema of a whole task file, of the section `sim` (physics) and of the section `viewer` (camera).
+
+Sections with terms, such as `rewards`, are described in `rlcli.config.schema.terms`.
+"""
 
 import math
 from typing import Annotated, Any, Literal

@@ -1,4 +1,7 @@
-"""Schema of uneven ground: a grid of generated patches (square pieces of ground), or a height field from a file."""
+"""Schema of uneven ground: a grid of generated patches (square pieces of ground), or a height field from a file.
+
+A patch has one kind of ground, such as stairs, and a difficulty from 0 to 1.
+"""
 
 from typing import Annotated, Literal
 

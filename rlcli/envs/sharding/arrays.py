@@ -1,4 +1,7 @@
-"""Tensors in shared memory, through which the main process and the workers exchange actions and results."""
+"""Tensors in shared memory, through which the main process and the workers exchange actions and results.
+
+`ArraySpec` describes a tensor; each process maps the same file into its memory.
+"""
 
 from __future__ import annotations
 

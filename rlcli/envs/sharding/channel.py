@@ -1,4 +1,7 @@
-"""Messages between the main process and a worker, over a pair of sockets."""
+"""Connection between the main process and a worker process, which sends and receives messages over a socket.
+
+Large tensors do not go through it, but through shared memory (`arrays`).
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Functions that join the saved states of shards into the state of one environment, and split such a state again."""
+"""Functions that join the saved states of shards into the state of one environment, and split such a state again.
+
+So a checkpoint does not depend on the number of processes.
+"""
 
 from __future__ import annotations
 

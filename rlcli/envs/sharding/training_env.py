@@ -1,4 +1,7 @@
-"""Function `make_training_env`, which builds the environment of a training, in one process or in several."""
+"""Function `make_training_env`, which builds the environment of a training, in one process or in several.
+
+The setting `scene.workers` determines the number of processes.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Pool of an environment's worker processes, as the main process starts, uses and ends them."""
+"""Pool of an environment's worker processes, as the main process starts, uses and ends them.
+
+`ShardedEnv` sends its requests through the pool, and gets errors and warnings of the workers back.
+"""
 
 from __future__ import annotations
 

@@ -1,1 +1,4 @@
-"""PPO: configuration, collector, learner, networks and the trainer."""
+"""The built-in PPO trainer: configuration, collector of rollouts, learner, networks.
+
+`trainer.PpoTrainer` combines them.
+"""

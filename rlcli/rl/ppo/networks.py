@@ -1,4 +1,7 @@
-"""Actor and critic in training: float32 networks, with all parameters in one vector and all gradients in another."""
+"""Actor and critic networks of the PPO trainer, in float32, and helpers that create and initialise them.
+
+All parameters are in one vector and all gradients in another, so that one operation processes all.
+"""
 
 from __future__ import annotations
 

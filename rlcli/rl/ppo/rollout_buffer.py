@@ -1,4 +1,7 @@
-"""Buffer of a rollout's samples, preallocated on the device and written in place."""
+"""Buffer of a rollout's samples, allocated once on the device and written in place.
+
+It also orders the samples into minibatches.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Stable-Baselines3's buffers with torch storage, so that samples are not copied to numpy and back."""
+"""Rollout and replay buffers for Stable-Baselines3's algorithms that store torch tensors.
+
+SB3's own buffers store numpy arrays, so that each sample would be copied twice.
+"""
 
 from __future__ import annotations
 

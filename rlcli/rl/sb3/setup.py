@@ -1,4 +1,7 @@
-"""Functions that create SB3's algorithm object, and the structure of its policy, from settings and an environment."""
+"""Functions that create SB3's algorithm object, and the structure of its policy, from settings and an environment.
+
+`Sb3Trainer` calls them when it is created.
+"""
 
 from __future__ import annotations
 

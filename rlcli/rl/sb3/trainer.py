@@ -1,4 +1,7 @@
-"""Trainer with the algorithms of Stable-Baselines3."""
+"""Trainer that drives an algorithm of Stable-Baselines3 one iteration at a time.
+
+It saves and restores the whole state of the algorithm, so that a run can be resumed exactly.
+"""
 
 from __future__ import annotations
 

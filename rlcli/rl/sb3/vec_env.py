@@ -1,4 +1,7 @@
-"""Adapter that gives a `VecEnv` the interface of Stable-Baselines3."""
+"""Adapter that gives a `VecEnv` the interface of Stable-Baselines3's environments.
+
+The trainer `sb3` passes it to the constructors of SB3's algorithms; `rlcli.adapters.sb3` returns it to scripts.
+"""
 
 from __future__ import annotations
 
