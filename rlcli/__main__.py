@@ -9,7 +9,7 @@ import sys
 
 try:
     current = os.getcwd()
-except OSError:  # the folder was deleted; `main` reports it
+except OSError:  # the current folder was deleted; `main` reports this
     current = ""
 if not sys.flags.safe_path and sys.path and sys.path[0] in ("", current):
     del sys.path[0]

@@ -163,7 +163,7 @@ def pip_install(package: str) -> str:
         package: arguments of `pip install`, separated by spaces.
     """
     root = Path(__file__).parents[1]
-    # its place in a wheel and in a checkout
+    # the place of the file in a wheel, and in a checkout
     lists = (Path(__file__).with_name("constraints.txt"), root / "constraints.txt")
     pins = [str(file) for file in lists if file.is_file() and package not in _UNPINNED]
     words = ["-c", pins[0]] if pins else []

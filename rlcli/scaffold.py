@@ -194,7 +194,7 @@ def _installed_version(name: str) -> str | None:
         return f"{name} {metadata.version(name)}"
     except metadata.PackageNotFoundError:
         return None
-    except Exception:  # its metadata is malformed
+    except Exception:  # the metadata of the installed distribution is malformed
         return name
 
 

@@ -91,7 +91,7 @@ class Robot:
         self.height = self._lower_to_ground() if self.free else 0.0
         """Height of the root above the ground in the default pose [m]."""
         locked = {j for j in self.joints if j not in self.actuator and self._is_locked(j)}
-        for pair in coupled_joints(model):  # one of the two joints moves with the other, such as two fingers
+        for pair in coupled_joints(model):  # coupled joints, such as two fingers: only one of the two is driven
             locked.add(next((j for j in pair[:2] if j not in self.actuator), -1))
         # without any actuator in the file, the task drives every joint that can move
         self.driven = [j for j in self.joints if j in self.actuator or not (model.nu or j in locked)]

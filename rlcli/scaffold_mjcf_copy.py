@@ -84,7 +84,7 @@ def put_robot_first(tree: ElementTree.Element, model: mujoco.MjModel) -> None:
     for body in bodies:  # other bodies keep their place relative to the robot
         place = model.body(body.get("name")).pos - model.body_pos[root]
         body.set("pos", " ".join(f"{value:.6g}" for value in place))
-    if 1.0 - 2.0 * float(np.square(model.body_quat[root, 1:3]).sum()) < 0.95:  # its z axis is not up
+    if 1.0 - 2.0 * float(np.square(model.body_quat[root, 1:3]).sum()) < 0.95:  # the z axis of the body is not up
         _insert_level_root(robot)
 
 

@@ -193,7 +193,7 @@ def _balance(robot: Robot) -> dict[str, Any]:
     moving = sorted([*robot.driven, *robot.passive])
     posed = [j for j in moving if not robot.is_wheel(j)]
     if not posed and not robot.free:
-        posed = moving  # a wheel on a fixed axis: there is nothing else to hold
+        posed = moving  # a wheel on a fixed axis: there is no other joint to hold
     passive = [j for j in robot.passive if j in posed]
     hinges = [j for j in passive if robot.model.jnt_type[j] == SCALAR[0]] or passive or posed
     held: dict[float, list[str]] = {}

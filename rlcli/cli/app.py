@@ -123,7 +123,8 @@ def main(arguments: list[str] | None = None) -> int:
     print_log_records()
     console.owns_process = arguments is None
     if console.owns_process:
-        os.environ.setdefault("PYTHONSAFEPATH", "1")  # MuJoCo's GLFW starts Python, which imports from this folder
+        # the library GLFW in MuJoCo starts a Python process, which otherwise imports from this folder
+        os.environ.setdefault("PYTHONSAFEPATH", "1")
         delay_garbage_collection()
         if hasattr(signal, "SIGALRM"):
             signal.signal(signal.SIGALRM, _on_alarm)
@@ -191,7 +192,8 @@ def _require_words(arguments: list[str]) -> None:
         value: name for name, value in os.environ.items() if name.startswith("RLCLI_")
     }
     for word, place in words.items():
-        if any("\ud800" <= character <= "\udfff" for character in word):  # a byte that is not UTF-8
+        # surrogates stand for bytes that are not UTF-8
+        if any("\ud800" <= character <= "\udfff" for character in word):
             raise UsageError(f"{place} is not UTF-8: '{word}'", hint="rename this file or folder")
 
 
@@ -221,7 +223,8 @@ def _run(arguments: list[str]) -> int:
         if failure.kind == "bug" and broken is not None:
             failure = broken
         if failure.kind == "bug" and isinstance(cause, SystemExit):
-            raise  # not from the code of a task or plugin: typer ends completions and closed pipes in this way
+            # the exception is not from a task or plugin: typer itself ends completions and closed pipes in this way
+            raise
         is_expected = isinstance(cause, ClickException | KeyboardInterrupt | typer.Abort)
         if failure.kind == "bug" or (console.debug and not is_expected):
             traceback.print_exc()
@@ -309,7 +312,7 @@ def _usage_message(error: ClickException) -> str:
     A wrong value, which pydantic rejects, gets the wording that a wrong value in a task file gets.
     """
     cause, message = error.__cause__, error.format_message()
-    if cause is None or not hasattr(cause, "errors"):  # only pydantic's ValidationError has it
+    if cause is None or not hasattr(cause, "errors"):  # only pydantic's ValidationError has the attribute `errors`
         return message
     from rlcli.config.messages import expected_and_found
 

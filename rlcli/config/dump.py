@@ -33,7 +33,7 @@ class _Dumper(yaml.SafeDumper):  # type: ignore[misc]  # PyYAML has no types
         """
         if kind is not yaml.ScalarNode or not implicit[0]:
             return str(super().resolve(kind, value, implicit))
-        if value == "<<":  # as a plain key it would be a merge key
+        if value == "<<":  # `<<` without quotes would be a merge key
             return "not a plain scalar"
         try:
             return f"tag:yaml.org,2002:{_TAGS[type(strict_yaml.load_value(value))]}"
@@ -42,7 +42,8 @@ class _Dumper(yaml.SafeDumper):  # type: ignore[misc]  # PyYAML has no types
 
 
 def _text(dumper: _Dumper, value: str) -> yaml.Node:
-    style = '"' if len(value.splitlines()) > 1 or value[-1:].isspace() else None  # double quotes keep it on one line
+    # in double quotes the text stays on one line
+    style = '"' if len(value.splitlines()) > 1 or value[-1:].isspace() else None
     return dumper.represent_scalar("tag:yaml.org,2002:str", value, style=style)
 
 
@@ -157,7 +158,7 @@ def preset_of(resolved: Resolved, names_agent: bool) -> dict[str, Any]:
     for path, _ in _explicit_origins(resolved):
         inner, value = _until_list(resolved.layers.data, path)
         if isinstance(value, dict) and value:
-            continue  # its entries have their own paths
+            continue  # an agent's entries have their own paths
         put(preset, ("agent", *inner[2:]) if inner[:2] == agent else inner, value)
     if names_agent:
         put(preset, ("agents", "default"), resolved.agent_name)

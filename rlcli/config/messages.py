@@ -65,7 +65,8 @@ def problems(
     outer = {path[:length] for path in grouped for length in range(len(path))}
     for path, items in grouped.items():
         if path in outer:
-            continue  # one alternative of a union; the error of another alternative is more precise
+            # the error belongs to one alternative of a union; the error of another alternative is more precise
+            continue
         message, hint, at = _message(path, items, model, data, locations or {}, top=not prefix)
         yield Problem(place(prefix + at), dotted(prefix + at), message, hint)
 

@@ -190,7 +190,8 @@ class _PlainData:
         if isinstance(value, BaseModel):
             data = {name: getattr(value, name) for name in type(value).model_fields if name in value.model_fields_set}
             if isinstance(value, AgentConfig):
-                data["algorithm"] = value.algorithm  # needed even if it is the default: it selects the agent's model
+                # the algorithm is needed even if it is the default, because it selects the agent's model
+                data["algorithm"] = value.algorithm
             return self.plain({**data, **(value.model_extra or {})}, path)
         if isinstance(value, Mapping):
             return {str(key): self.plain(item, (*path, str(key))) for key, item in value.items()}
@@ -292,7 +293,8 @@ def _registered(source: TaskSource) -> tuple[Any, dict[str, Any]]:
     """
     module = import_file(source.root / "__init__.py")
     wanted = str(source.python).removeprefix(str(source.root)).removeprefix(":")
-    if wanted and wanted not in registrations:  # a package need not import those below it that register tasks
+    # a package need not import the packages inside of it that register tasks
+    if wanted and wanted not in registrations:
         for file in sorted(source.root.rglob("__init__.py")):
             text = file.read_bytes()
             if b"register(" in text and wanted.encode() in text:

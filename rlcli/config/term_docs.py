@@ -102,7 +102,7 @@ def type_text(schema: Mapping[str, Any]) -> str:
         return str(schema["$ref"]).rsplit("/", 1)[-1]
     for union in ("anyOf", "oneOf", "allOf"):
         if union in schema:
-            # a number may be written as a fraction, `1/120`: its pattern is no type of its own
+            # a number may also be written as a fraction, `1/120`: the pattern for fractions is not shown
             parts = [part for part in schema[union] if "pattern" not in part or len(schema[union]) == 1]
             return " or ".join(dict.fromkeys(map(type_text, parts)))
     if "enum" in schema or "const" in schema:

@@ -39,7 +39,7 @@ def parse(file: Path) -> ast.Module:
         with warnings.catch_warnings(action="ignore"):
             return ast.parse(file.read_bytes(), filename=str(file))
     except SyntaxError as error:
-        error.filename = str(file)  # Python leaves it out for a file with a null byte
+        error.filename = str(file)  # Python does not set the name of the file if the file has a null byte
         raise
     except (ValueError, RecursionError, MemoryError) as error:
         raise SyntaxError(str(error) or "nested too deeply", (str(file), 1, 1, None)) from None

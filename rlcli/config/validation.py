@@ -55,7 +55,7 @@ class _AnyAgent(AgentConfig):
 
     @model_validator(mode="after")
     def _budget(self) -> Self:
-        return self  # the trainer may have other keys for its budget
+        return self  # a trainer that is not installed may have other keys for its budget
 
 
 Change = tuple[Path, Any, Origin]
@@ -290,7 +290,7 @@ class TaskCheck:
                 self.problem((*at, "trainer"), error.message, error.hint)
             return None, _AnyAgent
         spec = load_spec(entry, TrainerSpec, "trainer")
-        if isinstance(algorithm, dict):  # the form of another library, such as RSL-RL
+        if isinstance(algorithm, dict):  # a mapping is the form of another library, such as RSL-RL
             algorithm = str(algorithm.get("class_name", next(iter(spec.algorithms)))).lower()
         if not isinstance(algorithm, str):
             return spec, _AnyAgent

@@ -148,7 +148,8 @@ def _controls(env: VecEnv, terms: Iterable[BoundTerm]) -> list[dict[str, Any]]:
 
 def _control(env: VecEnv, term: BoundTerm, columns: tuple[int, int]) -> dict[str, Any]:
     ctrl, value = control_formula(env, term, columns) or ([], None)
-    if value is not None and isinstance(env, DirectEnv):  # its `command` is the clipped action: apply scale and offset
+    # the task's `command` is the clipped action: scale and offset are applied here
+    if value is not None and isinstance(env, DirectEnv):
         action = term.instance
         effort = op("mul", given("command", range(*columns)), _row(action._scale, action.size))
         if bool(torch.as_tensor(action._offset).any()):

@@ -281,7 +281,7 @@ def _site_pos(env: VecEnv, entity: Entity, sites: Columns, axes: Iterable[int] =
 def _ee_quat(env: VecEnv, entity: Entity, sites: Columns, make_quat_unique: bool = True) -> Formula:
     model, quats = entity.engine.model, []
     for site in _selected(entity.site_ids, sites):
-        # MjData has the orientation of a site as a matrix only, so the body's quaternion is turned by the site's
+        # MjData has the orientation of a site only as a matrix: multiply the quaternions of body and site
         body_quat = _row_of("xquat", int(model.site_bodyid[site]), 4)
         quats.append(op("product", body_quat, numbers(torch.tensor(model.site_quat[site]))))
     return _concatenated(*(op("unique", q) if make_quat_unique else q for q in quats))
@@ -412,7 +412,7 @@ def _binary(action: Any, columns: list[int]) -> Formula:
 
 
 _ACTIONS: Mapping[str, Callable[[Any, list[int]], Formula]] = {
-    # the policy's output `command` has their scale, offset and limits already
+    # the policy's output `command` already has scale, offset and limits of these terms
     **dict.fromkeys(
         ("JointEffort", "JointPosition", "JointVelocity"), lambda action, columns: given("command", columns)
     ),

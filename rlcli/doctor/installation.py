@@ -51,7 +51,7 @@ def entry_checks(group: str, timeout_s: float, stop: threading.Event) -> list[Ch
     """
     kind = group.rpartition(".")[2].removesuffix("s")
     entries, _ = catalog(group)
-    without = {"MUJOCO_GL"}  # a wrong value stops MuJoCo from starting; `graphics_check` reports it once
+    without = {"MUJOCO_GL"}  # a wrong value of MUJOCO_GL stops MuJoCo from starting; `graphics_check` reports this once
     rows = probe(entries, timeout_s, group, stop, without)
     checks = []
     for entry in entries:

@@ -162,8 +162,9 @@ class ArticulationView:
 
     def _write_state(self, name: str, values: Tensor, indices: Tensor | None, columns: Columns) -> None:
         self._write(self._env.engine.field(name), values, indices, columns)
-        self._write(getattr(self._env.sim, name), values, indices, columns)  # getters read this copy
-        self._env.sim.stamp += 1  # values that were computed from the old state are computed again
+        # the getters read `env.sim`, a copy of the engine's state
+        self._write(getattr(self._env.sim, name), values, indices, columns)
+        self._env.sim.stamp += 1  # invalidates cached values that were computed from the old state
 
     def _write(self, field: Tensor, values: Tensor, indices: Tensor | None, columns: Columns) -> None:
         if indices is not None and field.device.type == "cpu":

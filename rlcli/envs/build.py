@@ -74,7 +74,8 @@ def build_simulation(scene: Scene, binder: Binder, device: torch.device, seed: i
     try:
         model = scene.compile(on_cpu=device.type == "cpu")
     except ConfigError:
-        found, binder.problems = binder.problems, []  # the cause comes first: without its model a robot has no joints
+        # the cause comes first: without the entity's model, names of joints are not found either
+        found, binder.problems = binder.problems, []
         for problem in scene.broken_models():
             binder.add_problem(problem.path, str(problem), problem.hint)
         binder.problems += found

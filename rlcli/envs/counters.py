@@ -156,7 +156,8 @@ class EpisodeCounters(TensorState):
         """Count the episodes that end; return masks of them, and of those that end by time-out alone. (num_envs,)"""
         failed, late = self._as_field(terminated), self._as_field(truncated)
         finished = failed | late
-        self.index_field += finished  # before the selection, whose random numbers depend on this counter
+        # must come before the selection is made: its random numbers depend on this counter
+        self.index_field += finished
         return finished, late > failed
 
     def reset(self, selection: Selection) -> None:

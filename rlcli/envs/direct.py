@@ -206,7 +206,7 @@ class DirectEnv(VecEnv):
         task = self.task
         self._returns = torch.zeros(self.num_envs, device=self.device)
         self._fresh = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
-        self._reset_in_step: Selection | None = None  # the environments of `_fresh`, as one selection
+        self._reset_in_step: Selection | None = None  # selection of the environments in `_fresh`
         self._return_field, self._fresh_field = self.engine.as_field(self._returns), self.engine.as_field(self._fresh)
         self._resets_by_selection = type(task).reset is not DirectTask.reset
         self._resets_by_id = type(task).reset_idx is not DirectTask.reset_idx
@@ -298,7 +298,7 @@ class DirectEnv(VecEnv):
             failed = failed | diverged
             if self.config.divergence_reward is not None:
                 reward.masked_fill_(diverged, self.config.divergence_reward)
-            if not self.engine.asynchronous:  # a GPU reports it later, in `check`
+            if not self.engine.asynchronous:  # on a GPU, `check` reports it later
                 reward.masked_fill_(diverged & ~reward.isfinite(), 0.0)
         self._guard.require_finite(reward, "the reward")
         self._returns += reward

@@ -92,10 +92,11 @@ class ManagedEnv(VecEnv):
             setattr(self, f"{section.removesuffix('s')}_manager", manager(self._bound[section], self._context))
 
     def _build_workflow(self) -> None:
-        # in this order: the first value of a term may use a manager that is built before
+        # the order matters: the first value of a term may use a manager that was built before
         context, task = self._context, self.config
         if self.event_manager.derives:
-            self.engine.set_constants()  # allocates per-environment constants, and derives all of them in the same way
+            # allocates the constants of each environment, and derives all of them in the same way
+            self.engine.set_constants()
         self.event_manager.startup(self._select_all())
         reward_dt = self.step_dt if task.reward_dt_scaling else 1.0
         self.reward_manager = RewardManager(self._bound["rewards"], context, reward_dt, task.divergence_reward)

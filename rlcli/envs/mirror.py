@@ -179,7 +179,7 @@ class _MirrorTest:
                 height = env.default_state["qpos"][start + 2]
                 qpos[:_PAIRS, start + 2] = height * (0.85 + 0.4 * torch.rand(_PAIRS, generator=self._random))
                 turn = 0.7 * self._normal_samples(3).double()
-                turn[: _PAIRS // 2] *= 3.0  # half of them lie on the ground
+                turn[: _PAIRS // 2] *= 3.0  # half of the robots lie on the ground
                 qpos[:_PAIRS, start + 3 : start + 7] = from_euler(*turn.unbind(1))
             elif model.jnt_limited[joint]:
                 qpos[:_PAIRS, start].clamp_(*model.jnt_range[joint].tolist())

@@ -192,7 +192,7 @@ class _Push:
     def __call__(self) -> None:
         """Push in the environments whose episode has reached the random step of its push."""
         env = self._env
-        # columns: the step of the push, and its direction
+        # the random numbers are the step of the push and its direction
         uniform = random.uniform(_keys(env, env.episode_index), self._stream, 0, 2)
         push_step = 1 + (uniform[:, 0] * (env.max_episode_length // 2)).astype(np.int64)
         now = (env.episode_length_buf == torch.from_numpy(push_step).to(env.device)) & (self._values > 0)
@@ -411,7 +411,7 @@ def _axes(env: VecEnv, field: str, sweep: Sweep) -> list[int] | None:
         NameProblem: if a row has several values, and all of them would be set to the same value.
     """
     if field == "geom_friction":
-        return [0]  # sliding friction; the other two are torsional and rolling friction
+        return [0]  # index 0 is sliding friction; 1 and 2 are torsional and rolling friction
     own = sweep.parameter in PHYSICAL
     value = np.asarray(getattr(env.engine.model, field)) if field != "opt.gravity" else np.zeros((1, 3))
     width = value[:1].size

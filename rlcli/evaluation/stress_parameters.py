@@ -80,7 +80,7 @@ class Sweep:
         if self.parameter in _INTEGER:
             return float(round(low + (high - low) * share))
         value = low * (high / low) ** share if self.spacing == "geometric" else low + (high - low) * share
-        return float(f"{value:.12g}")  # so that the middle of 0.8:1.25 is exactly 1
+        return float(f"{value:.12g}")  # rounded, so that the middle of 0.8:1.25 is exactly 1
 
     def share(self, value: float) -> float:
         """Return where a value lies in the range: 0 at the lowest value, 1 at the highest."""

@@ -146,7 +146,7 @@ class _TaskFinder(MetaPathFinder):
         if not any(Path(spec.origin).is_relative_to(root) for root in (*_roots, *_folders_above())):
             return None
         if path is None:
-            OWN_NAMES.setdefault(name, name)  # its modules are files of the task, too
+            OWN_NAMES.setdefault(name, name)  # the package's modules are files of the task, too
         known = _by_file.get(spec.origin)
         if known is not None and sys.modules.get(known.__name__) is known:
             spec.loader = _KnownFileLoader(known)

@@ -185,7 +185,7 @@ _TORCH_DEFAULTS: _TorchSettings = ("torch.float32", "cpu", True)
 def _torch_settings() -> _TorchSettings | None:
     """Return the present settings of torch; None if torch is not imported."""
     torch = sys.modules.get("torch")
-    if torch is None or not hasattr(torch, "get_default_device"):  # its import may have failed
+    if torch is None or not hasattr(torch, "get_default_device"):  # the import of torch may have failed
         return None
     return str(torch.get_default_dtype()), str(torch.get_default_device()), torch.is_grad_enabled()
 
@@ -205,7 +205,8 @@ def _restore_torch(before: _TorchSettings, changed: _TorchSettings) -> None:
 
 def error_location(error: BaseException) -> str:
     """Return ` (file:line)` of the code that raised an error; empty if the message has it already (SyntaxError)."""
-    own = (__file__, os.path.join(os.path.dirname(__file__), "task_code_monitor.py"))  # its `exit_refused` raises
+    # its function `exit_refused` raises errors itself
+    own = (__file__, os.path.join(os.path.dirname(__file__), "task_code_monitor.py"))
     frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename not in own]
     if isinstance(error, SyntaxError) or not frames or frames[-1].filename.startswith("<frozen"):
         return ""

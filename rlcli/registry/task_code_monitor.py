@@ -149,7 +149,8 @@ def observe_task_code() -> Iterator[None]:
     These are its warnings, records of its loggers without a handler, errors in its threads and destructors, and calls
     that have not returned after `SLOW_S`. Each line of code is reported once.
     """
-    for function in (warn_once, _is_task_file, _plugins):  # an earlier command of this process may have called them
+    # an earlier command of this process may have filled these caches
+    for function in (warn_once, _is_task_file, _plugins):
         function.cache_clear()
     places: set[str] = set()
 
@@ -167,7 +168,8 @@ def observe_task_code() -> Iterator[None]:
             place = f"{frames[-1][0].f_code.co_filename}:{frames[-1][1]}" if frames else place_in_task(sys._getframe(1))
             if found.exc_value is None or place is None:
                 other(found)
-            elif not (isinstance(found.exc_value, SystemExit) and hasattr(found, "thread")):  # which ends its thread
+            # SystemExit in a thread only ends this thread
+            elif not (isinstance(found.exc_value, SystemExit) and hasattr(found, "thread")):
                 report(place, f"error in a thread or destructor: {error_with_type(found.exc_value)}")
 
         return hook
@@ -208,7 +210,7 @@ class _LastResort(logging.Handler):
         """Report the text of a record, with the file and line that logged it."""
         try:
             text = record.getMessage()
-        except Exception as error:  # such as `logging.warning("%d", "x")`
+        except Exception as error:  # for example `logging.warning("%d", "x")`
             text = f"a log record whose text cannot be formatted: {type(error).__name__}"
         self._report(f"{record.pathname}:{record.lineno}", text)
 

@@ -165,7 +165,7 @@ def write_dump(env: Environment, found: list[Divergence], pending: bool, folder:
     Raises:
         MachineError: if the disk reports an error, or the folder is a link.
     """
-    if folder.is_symlink():  # it may come with an unpacked archive and lead anywhere
+    if folder.is_symlink():  # the link may come from an unpacked archive and lead anywhere
         raise MachineError(f"{folder} is a link, through which rlcli does not write; remove it")
     engine = env.engine.replayable
     assert engine is not None

@@ -301,7 +301,7 @@ def _labels(groups: Sequence[Curve]) -> list[str]:
         keys = dict.fromkeys(key for other in same_task for key in other.settings if key not in ("task", "agent"))
         differing = [key for key in keys if differ(key, same_agent if key.startswith("agents.") else same_task)]
         given = group.histories[0].run.record.get("given") or {}
-        differing.sort(key=lambda key: key not in given)  # first what the user has set for this run
+        differing.sort(key=lambda key: key not in given)  # settings that the user has set for this run come first
         parts += [
             f"{_short_key(key, differing)}={_short(group.settings.get(key))}" for key in differing[:_MAX_DIFFERENCES]
         ]

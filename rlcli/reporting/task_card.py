@@ -354,7 +354,8 @@ def _hooks(file: Path, class_name: str) -> list[tuple[str, str, str]]:
     A row is: the part of the task that the hook decides, its name, and the first paragraph of its docstring.
     """
     docstrings: dict[str, str] = {}
-    for source in reversed(ClassSearch().lineage(file, class_name)):  # bases first, so that a class overrides them
+    # base classes come first, so that the hooks of a class replace those of its bases
+    for source in reversed(ClassSearch().lineage(file, class_name)):
         functions = [inner for inner in source.node.body if isinstance(inner, ast.FunctionDef)]
         docstrings |= {inner.name: text for inner in functions if (text := ast.get_docstring(inner))}
         docstrings[class_name] = ast.get_docstring(source.node) or ""

@@ -49,7 +49,7 @@ class Recording:
         self._work, self._holders = work, holders
         self._device = torch.device("cuda", torch.cuda.current_device() if device.index is None else device.index)
         self._graph: torch.cuda.CUDAGraph | None = None
-        self._warp_capture: Any = None  # keeps the memory alive that Warp allocated during the recording
+        self._warp_capture: Any = None  # keeps the memory alive that Warp has allocated during the recording
         self._eager_runs, self._ready = 0, False
         self.refusal: str | None = None
         """Reason why the function cannot be recorded; None: none was found so far."""
@@ -104,7 +104,7 @@ class Recording:
                 finally:
                     self._warp_capture = wp.capture_end(stream=on), on
         except RuntimeError as error:
-            for holder, name, value in tensors:  # the failed recording may have rebound them
+            for holder, name, value in tensors:  # the failed recording may have replaced these tensors by new ones
                 setattr(holder, name, value)
             frames = reversed(traceback.extract_tb(error.__traceback__))
             culprit = next(frame for frame in frames if "torch" not in frame.filename)

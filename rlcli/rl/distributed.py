@@ -125,7 +125,9 @@ def join(device: str) -> ProcessGroup:
         return _current
     import torch
     import torch.distributed as dist
-    import torch.distributed.nn  # before the group exists: default arguments of its functions would keep it alive
+
+    # imported before the group exists: default arguments of its functions would keep the group alive
+    import torch.distributed.nn
 
     on_gpu = device.startswith("cuda")
     if on_gpu:
@@ -149,7 +151,7 @@ def leave() -> None:
         import torch.distributed as dist
 
         _current = ProcessGroup()
-        gc.collect()  # destroys captured graphs: NCCL blocks for ever while one uses the group
+        gc.collect()  # destroys captured CUDA graphs: NCCL blocks for ever while a graph uses the group
         with contextlib.suppress(RuntimeError):
             dist.destroy_process_group()
 
@@ -167,8 +169,9 @@ def launch(processes: int, arguments: Sequence[str]) -> int:
     from torch.distributed.elastic.multiprocessing.api import SignalException
     from torch.distributed.elastic.multiprocessing.errors import ChildFailedError
 
-    os.environ.setdefault("OMP_NUM_THREADS", "1")  # else the launcher warns; torch_threads sets the threads
-    logging.getLogger("torch.distributed").setLevel(logging.CRITICAL)  # each process prints its own error already
+    # otherwise the launcher prints a warning; torch_threads sets the number of threads later
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    logging.getLogger("torch.distributed").setLevel(logging.CRITICAL)  # each process prints its own error
     options = ["--standalone", f"--nproc-per-node={processes}"]
     command = run.parse_args([*options, "--no-python", *python_command("-m", "rlcli", *arguments)])  # type: ignore[no-untyped-call]  # torch has no type here
     try:

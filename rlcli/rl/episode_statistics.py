@@ -66,7 +66,8 @@ class EpisodeStatistics:
         weight = torch.ones(matrix.shape[1]) if episodes.mask is None else episodes.mask.float()
         names = ",".join([*values, *flags, "length"])
         if names not in self._sums:
-            with torch.inference_mode(False):  # `flush` may write to it outside of inference mode
+            # outside of inference mode, because `flush` may write to this tensor there
+            with torch.inference_mode(False):
                 self._sums[names] = torch.zeros(len(matrix), dtype=torch.float32, device=matrix.device)
         self._sums[names].addmv_(matrix, weight)
 
@@ -100,7 +101,7 @@ class EpisodeStatistics:
     def load(self, state: dict[str, Any]) -> None:
         """Restore the state returned by `state()`."""
         for pending in self._sums.values():
-            pending.zero_()  # in place: a CUDA graph adds to these tensors
+            pending.zero_()  # in place, because a CUDA graph adds to these tensors
         self._recent = deque(list(row) for row in state["recent"])
         self.total = state["total"]
 

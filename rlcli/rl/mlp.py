@@ -159,7 +159,8 @@ class Mlp(nn.Sequential):
 def _hidden(inputs: Tensor, linears: list[nn.Linear], activations: list[Activation]) -> Tensor:
     """Return the outputs of the hidden layers, each followed by its activation. (n, d) -> (n, h)"""
     outputs = torch.empty(len(inputs), linears[-1].out_features)
-    rows = max(512, part_rows(linears) // 512 * 512)  # with multiples of 512 a row's bits do not depend on its part
+    # if the number of rows is a multiple of 512, a row's bits do not depend on the part it is in
+    rows = max(512, part_rows(linears) // 512 * 512)
     starts = [rows * number for number in range(max(1, len(inputs) // rows))]
     ends = [*starts[1:], len(inputs)]
     inference = torch.is_inference_mode_enabled()  # a setting of each thread

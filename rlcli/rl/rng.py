@@ -63,7 +63,7 @@ def load_rng_state(state: Mapping[str, Tensor]) -> None:
     """
     require_matching_tensors(state, rng_state(), "rng")
     position, has_gauss = state["numpy.position"]
-    require_in_range(position, 0, len(state["numpy.keys"]), "numpy.position")  # numpy does not check it
+    require_in_range(position, 0, len(state["numpy.keys"]), "numpy.position")  # numpy does not check the position
     require_in_range(has_gauss, 0, 1, "numpy.position")
     for name in ("numpy.keys", "python.words"):
         require_in_range(state[name], 0, 2**32 - 1, name)

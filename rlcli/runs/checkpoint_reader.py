@@ -362,7 +362,7 @@ def _tensors(data: bytes, file: Path) -> dict[str, Tensor]:
     length = int.from_bytes(data[:8], "little")
     if length > min(_HEADER_LIMIT, len(data) - 8):
         raise CheckpointError(f"{file} is corrupt: not a safetensors file; use an older checkpoint: RUN@step:N")
-    check_json(_Header, parse_json(data[8 : 8 + length], file), file)  # shapes that torch accepts
+    check_json(_Header, parse_json(data[8 : 8 + length], file), file)  # the check ensures shapes that torch accepts
     try:
         return safetensors.torch.load(data)
     except (SafetensorError, RuntimeError, ValueError, KeyError, MemoryError) as error:

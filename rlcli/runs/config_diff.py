@@ -151,7 +151,7 @@ def category(path: Path, *, observes_images: bool = False) -> str:
     if path[:2] == ("scene", "entities") and (path[3:4] and path[3] in _NOT_PHYSICS):
         return "MDP"
     if path[:2] == ("scene", "entities") and path[3:4] == ("joints",) and path[-1] == "velocity_limit":
-        return "MDP"  # terms read it, the physics does not
+        return "MDP"  # only terms read this limit, the physics does not
     return "physics" if path[0] in _PHYSICS else "MDP"
 
 

@@ -133,7 +133,7 @@ def state_of(run: Run) -> tuple[str, str | None]:
     recorded = run.record.get("state", "")
     if is_locked(run.folder):
         return "running", None
-    if recorded == "running":  # it may have ended between the reading of its record and that of its lock
+    if recorded == "running":  # the run may have ended after its record was read and before its lock is tested
         with contextlib.suppress(CheckpointError, OSError):
             run.record = open_run(run.folder).record
         recorded = run.record.get("state", "")
@@ -206,7 +206,8 @@ def _evaluation(run: Run) -> dict[str, Any]:
         names = sorted(name for name in os.listdir(run.folder / "evaluations") if name.endswith(".json"))
     except OSError:
         return {}
-    from rlcli.runs.eval_store import read_evaluation  # its import takes longer than the rest of this module
+    # imported here, because the import takes longer than the rest of this module
+    from rlcli.runs.eval_store import read_evaluation
 
     for name in names[: -_MAX_ROWS - 1 : -1]:
         try:

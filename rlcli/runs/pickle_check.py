@@ -92,7 +92,7 @@ class _Simulation:
             case "REDUCE":
                 arguments, function = stack.pop(), stack.pop()
                 stack.append(_result(function.kind, arguments))
-            case "BINPERSID":  # a storage: torch uses an item of this tuple as the key of a dictionary
+            case "BINPERSID":  # BINPERSID makes a storage: torch uses an item of this tuple as the key of a dictionary
                 if stack.pop().depth > 1:
                     raise _RefusedError("has a tensor whose storage has no simple name")
                 stack.append(_Value())

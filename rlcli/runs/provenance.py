@@ -63,7 +63,7 @@ def environment_record(resolved: Resolved, engine_threads: int, torch_threads: i
         "python": platform.python_version(),
         "platform": platform.platform(),
         "machine": platform.machine(),
-        "libc": " ".join(platform.libc_ver()).strip(),  # torch and MuJoCo call its functions, such as sin
+        "libc": " ".join(platform.libc_ver()).strip(),  # torch and MuJoCo call functions of the C library, such as sin
         "versions": versions(resolved),
         "sources": sources(resolved),
         "cpu": processor(),

@@ -109,7 +109,7 @@ def _opened(folders: Iterable[Path]) -> tuple[list[Run], dict[Path, CheckpointEr
         try:
             runs.append(open_run(folder))
         except CheckpointError as error:
-            if os.path.lexists(folder / RECORD):  # otherwise it is another folder, not a run
+            if os.path.lexists(folder / RECORD):  # without run.json the folder is not a run
                 refused[folder] = error
     return sorted(runs, key=lambda run: (str(run.record.get("started", "")), run.folder.name)), refused
 
@@ -232,7 +232,7 @@ def _find_run(reference: str, runs_dir: Path, task: str | None) -> tuple[Run, st
             )
             hint = "; ".join(filter(None, (near, f"rlcli train {task or 'TASK'} starts one")))
             raise CheckpointError(f"there is no run{of_task} in {runs_dir.absolute()}", hint=hint)
-        # trials of a sweep, pruned ones and trainings with poor settings among them, are used by name only
+        # trials of a sweep may be pruned or have poor settings, so they are used only if the user names them
         newest = next((run for run in reversed(runs) if not _is_of_sweep(run)), runs[-1])
         if seconds_since(newest.record.get("started")) < -60:
             _log.warning(

@@ -41,7 +41,7 @@ def is_known(record: Mapping[str, Any]) -> bool:
     try:
         key = _key(record)
         return read_plain(_file(key), _MAX_BYTES) == key.encode()
-    except (OSError, RuntimeError, ValueError):  # no such file; a loop of links; an invalid name
+    except (OSError, RuntimeError, ValueError):  # there is no such file, links form a loop, or the name is invalid
         return False
 
 
@@ -54,7 +54,8 @@ def _key(record: Mapping[str, Any]) -> str:
     """Return the text that identifies the code of a task's record: the real path of its folder, or `FILE:ATTRIBUTE`."""
     if not record.get("python"):
         return str(Path(str(record["folder"])).resolve())
-    path, attribute = python_place(str(record["python"]))  # resolved as the loader does it
+    # the path is resolved in the same way as when the task is loaded
+    path, attribute = python_place(str(record["python"]))
     return f"{path}:{attribute}" if attribute else str(path)
 
 

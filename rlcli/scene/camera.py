@@ -311,7 +311,8 @@ def _end_threads(orders: list[_Orders], threads: list[threading.Thread], process
 def _set_clip_planes(view: mujoco.MjvGLCamera, near: float, far: float) -> None:
     """Set the near and far clipping distances of a camera [m]; its field of view stays the same."""
     if not view.orthographic:
-        for name in ("center", "width", "bottom", "top"):  # MuJoCo measures them on the near plane
+        # MuJoCo stores the field of view as lengths on the near plane
+        for name in ("center", "width", "bottom", "top"):
             value = getattr(view, f"frustum_{name}") * near / view.frustum_near
             setattr(view, f"frustum_{name}", value)
     view.frustum_near, view.frustum_far = near, far

@@ -174,7 +174,7 @@ class Entity:
             selection: the environments of the rows; None: all.
         """
         com, own = self._com, self.engine.expanded("body_ipos")
-        if own is not None:  # an event randomises it
+        if own is not None:  # an event has randomised the masses
             com = own.view(len(own), -1, 3)[:, self.root_body].float()
             com = com if selection is None else selection.read_view(com)
         return rotate(quat, cross(angular_b, com.expand_as(angular_b)))

@@ -95,7 +95,7 @@ def frame_of_start_pose(child: mujoco.MjSpec, entity: EntityConfig) -> tuple[Flo
     """
     pos, quat = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
     element: Any = child.worldbody.first_body()
-    while element is not None:  # the root, then the <frame> elements around it
+    while element is not None:  # `element` is the root, then each <frame> element around it
         pos, quat = _product(element.pos, _orientation(element), pos, quat)
         element = element.frame
     start_pos = pos if entity.pos is None else np.array(entity.pos)

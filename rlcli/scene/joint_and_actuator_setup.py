@@ -161,7 +161,7 @@ def joint_settings(entity: EntityConfig, joint: str) -> JointConfig:
     """Return the settings of a joint from `joints` of its entity; if several patterns match, later ones win."""
     merged: dict[str, object] = {}
     for pattern, change in entity.joints.items():
-        with contextlib.suppress(NameProblem):  # the pattern matches other joints only
+        with contextlib.suppress(NameProblem):  # a pattern that matches other joints only is no error here
             match(pattern, [joint], "joint")
             merged.update(change.model_dump(exclude_none=True))
     return JointConfig.model_validate(merged)
@@ -175,7 +175,8 @@ def model_actuator_kind(model: mujoco.MjModel, actuator: int) -> str:
 def _actuator_kind(actuator: Any) -> str:
     """Return the kind of an actuator of an MjSpec or of a compiled model: motor, position, velocity or other."""
     kinds = (actuator.trntype, actuator.dyntype, actuator.gaintype, actuator.biastype)
-    *known, bias = (int(np.asarray(kind).item()) for kind in kinds)  # arrays of one element in a compiled model
+    # in a compiled model these are arrays of one element
+    *known, bias = (int(np.asarray(kind).item()) for kind in kinds)
     gain, biases = actuator.gainprm[0], actuator.biasprm
     if tuple(known) != _KNOWN_ACTUATORS:
         return "other"
@@ -194,7 +195,8 @@ def _override(joint: mujoco.MjsJoint, change: JointConfig, *, degrees: bool) -> 
         value, attribute = getattr(change, key), key.replace("_", "")
         if value is not None:
             current = getattr(joint, attribute)
-            if isinstance(current, np.ndarray):  # MuJoCo 4: coefficients of a polynomial, the linear one first
+            # in MuJoCo 4 the value is a list of polynomial coefficients, the linear one first
+            if isinstance(current, np.ndarray):
                 current[:] = 0.0
                 current[0] = value
             else:

@@ -140,7 +140,7 @@ def stored_arrays(name: str, attributes: dict[str, str]) -> Iterator[tuple[str, 
         for key in attributes:
             if key.startswith(("nuser_", "nkey")):
                 yield key, number_of(attributes[key])
-    elif "user" in attributes:  # MuJoCo stores as many numbers with all other elements of this kind
+    elif "user" in attributes:  # MuJoCo then stores this number of values with every element of the same kind
         yield name, float(len(attributes["user"].split()))
 
 
@@ -168,7 +168,7 @@ def element_cost(name: str, attributes: dict[str, str]) -> float:
         return 1.0 + math.prod(params) * max(params, default=1.0) / 10 + len(attributes.get("vertex", "")) / 10_000
     if name == "size":
         return 1.0 + sum(number_of(attributes.get(key)) for key in attributes if key != "memory") / 100
-    if name == "lengthrange":  # the compiler simulates so many steps for every muscle
+    if name == "lengthrange":  # the compiler simulates this number of steps for every muscle
         total, timestep = attributes.get("inttotal", "10"), attributes.get("timestep", "0.01")
         return 1.0 + number_of(total) / max(number_of(timestep), 1e-9) / 10
     if name == "config" and attributes.get("key") in ("size", "nchannel"):  # of the plugin touch_grid

@@ -123,7 +123,7 @@ class Scene:
                 if hasattr(child.option, option):
                     setattr(self.spec.option, option, getattr(child.option, option))
         for key in list(child.keys):
-            child.delete(key)  # a keyframe of one entity has the wrong size in a scene of several entities
+            child.delete(key)  # a keyframe of one entity has a wrong size in a scene with several entities
         self.spec.memory = max(self.spec.memory, child.memory)
         pos, quat = frame_of_start_pose(child, entity)
         frame = self.spec.worldbody.add_frame(pos=pos, quat=quat)

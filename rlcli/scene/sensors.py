@@ -81,7 +81,7 @@ class ContactSensor(TensorState):
         self.force.copy_(force)
         self.found.copy_(found)
         in_air = ~found
-        torch.logical_and(found, self.air_time, out=self.first_contact)  # a time that is not 0 counts as true
+        torch.logical_and(found, self.air_time, out=self.first_contact)  # a time other than 0 counts as true
         torch.logical_and(in_air, self.contact_time, out=self.first_air)
         self._running_times.add_(dt)
         torch.where(self.first_contact, self.air_time, self.last_air_time, out=self.last_air_time)
@@ -147,7 +147,7 @@ class RaySensor(LazySensor):
         """Names of the sensor's r rays."""
         self._distance = torch.zeros(n, r, device=engine.device)
         self._missed = torch.zeros(n, r, dtype=torch.bool, device=engine.device)
-        # x, y and z of all hits are one plane each: terms read the heights
+        # x, y and z of the hits are stored separately, because terms read all heights at once
         planes = torch.zeros(3, n, r, device=engine.device)
         self._hits = planes.movedim(0, 2)
         self._position = torch.zeros(n, 3, device=engine.device)
@@ -266,7 +266,7 @@ class RaySensor(LazySensor):
         x, y, z = (rotate(quat, axis.expand(len(quat), 3)) for axis in self._unit)
         if self._config.alignment == "base":
             return torch.stack([x, y, z], dim=1)
-        ahead, left = x[:, 0] + 1e-12, x[:, 1]  # 1e-12: the yaw of a body that points straight up is 0
+        ahead, left = x[:, 0] + 1e-12, x[:, 1]  # 1e-12 makes the yaw 0 for a body whose x axis is vertical
         norm = (ahead * ahead + left * left).sqrt()
         cos, sin, zero = ahead / norm, left / norm, torch.zeros_like(norm)
         rows = [cos, sin, zero, -sin, cos, zero, zero, zero, zero + 1.0]

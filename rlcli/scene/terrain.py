@@ -252,7 +252,8 @@ def _heights_below_blocks(patch: Patch) -> Heights:
     """Return heights for the height field of a patch with boxes, which stay below the boxes [m]."""
     lowest = min(block.top for block in patch.blocks)
     inside = np.zeros_like(patch.heights)
-    inside[1:-1, 1:-1] = lowest - 0.05 if lowest < 0.0 else 0.0  # 5 cm lower, so that no two surfaces coincide
+    # 5 cm lower than the blocks, so that no two surfaces are in one plane
+    inside[1:-1, 1:-1] = lowest - 0.05 if lowest < 0.0 else 0.0
     return inside
 
 

@@ -134,7 +134,7 @@ def open_mjcf(checked: CheckedModel, *, compiled: bool = False) -> mujoco.MjSpec
     try:
         quiet_mujoco()
         spec = mujoco.MjSpec.from_file(str(file))
-        if compiled or spec.compiler.settotalmass > 0:  # `write_masses` compiles it
+        if compiled or spec.compiler.settotalmass > 0:  # `write_masses` compiles the model
             with warnings.catch_warnings():  # a deprecated attribute of the file
                 warnings.simplefilter("ignore")
                 spec.compile()

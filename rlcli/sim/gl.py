@@ -67,7 +67,7 @@ def open_context(width: int, height: int, *, in_thread: bool = False) -> tuple[A
             context.make_current()
             if backend == "glfw" and not _has_window():
                 raise MachineError("no window can be opened on the display")
-        except Exception as error:  # each backend raises other errors: missing library, device, display
+        except Exception as error:  # each backend raises different errors: missing library, no device, no display
             tried.append(f"{backend} ({one_line(error, 100)})")
             _unload_opengl()
             continue

@@ -129,7 +129,8 @@ class _WithoutProfiler:
     def __exit__(self, *error: object) -> None:
         with self._lock:
             self._inside -= 1
-            if not self._inside and self._callback.value is None:  # not None: other code has set a callback
+            # a value other than None means that other code has set a callback
+            if not self._inside and self._callback.value is None:
                 self._callback.value = self._clock
 
 

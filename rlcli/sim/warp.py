@@ -158,7 +158,7 @@ class WarpEngine(WarpWorlds):
         self, points: Tensor, directions: Tensor, *, groups: Groups, exclude: int, selection: Selection | None
     ) -> Tensor:
         """Return the distance to the first geom on each ray, -1 without a hit (`Engine.rays`). (num_envs, rays) [m]"""
-        self.field("geom_xpos")  # bind it, so that every step updates the geoms' positions
+        self.field("geom_xpos")  # requests the field, so that every step updates the positions of geoms
         shape = (self.num_envs, points.shape[1])
         distance = torch.empty(shape, device=points.device)
         visible = _GroupFlags(*(-1.0 if groups is None else float(g in groups) for g in range(mujoco.mjNGROUP)))

@@ -133,14 +133,15 @@ class WarpWorlds:
                 raise ValueError(f"'{name}' is not a field of MuJoCo Warp's data; {hint}")
             saved = self._substep_values()
             self._fields[name] = wp.to_torch(array)
-            if name in INPUTS:  # it still has the model's value
+            if name in INPUTS:  # a new input field still has the value of the model
                 self._start_inputs[name] = self._fields[name].view(self.num_envs, -1).clone()
             stages = self._stages.stages_of(name)
             self._derived |= stages
             self._needs_only_motion = all(map(self._stages.needs_only_motion, self._fields))
-            if name in ("cacc", "cfrc_int"):  # the velocity stage uses their memory for intermediate values
+            # the velocity stage uses the memory of these fields for intermediate values
+            if name in ("cacc", "cfrc_int"):
                 self._overwritten[name] = wp.empty_like(array)
-            self._graphs.clear()  # they do not compute the new field
+            self._graphs.clear()  # the recorded graphs do not compute the new field
             if stages:
                 with self._launching():
                     self._update_velocities()

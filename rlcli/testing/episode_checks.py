@@ -169,7 +169,7 @@ def final_observations(subject: TaskUnderTest) -> Iterator[Finding]:
     result = _env_pair(subject).step()[1]
     done = (result.terminated | result.truncated)[_ENDING]
     if not bool(done.all()):
-        return  # the check `truncation` reports this
+        return  # the check `truncation` reports this problem
     if result.final_obs is None:
         message = f"the episodes of environments {_ENDING} ended without final observations"
         yield error_at("final_obs", message, "this is a defect of rlcli: please report it")
@@ -210,7 +210,7 @@ def back_fill(subject: TaskUnderTest) -> Iterator[Finding]:
     for env in (pair.kept, pair.ended):
         expire_episodes(env, _ENDING)
     results = pair.step()
-    # a termination of the task may have ended an episode before, in one environment of the pair only
+    # a termination of the task may have ended an episode earlier in only one of the two environments
     same_episode = pair.kept.episode_index == pair.ended.episode_index
     rows = [row for row in _ENDING if bool(same_episode[row])]
     for group, first in results[0].obs.items():
@@ -323,7 +323,7 @@ def observation_after_reset(subject: TaskUnderTest) -> Iterator[Finding]:
     task.get_observations = recorded  # type: ignore[method-assign]
     result = pair.step()[1]
     done = (result.terminated | result.truncated).tolist()
-    # an episode of the others may end in this step too
+    # an episode of other environments may end in this step, too
     running = [row for row in range(subject.num_envs) if row not in _ENDING and not done[row]]
     for before, after in pairwise(observations):
         rows = [row for row in running if not equal_values(before[row], after[row])]

@@ -371,7 +371,7 @@ def discount_of(agent: AgentConfig | None) -> float | None:
     """Return the discount factor in an agent's settings, also in nested ones; None if there is none."""
     if agent is None:
         return None
-    settings = sorted(leaves(agent.model_dump()), key=lambda leaf: len(leaf[0]))  # the least nested one first
+    settings = sorted(leaves(agent.model_dump()), key=lambda leaf: len(leaf[0]))  # the least nested value comes first
     discounts = (v for path, v in settings if path and path[-1] in ("gamma", "discount", "discount_factor"))
     return next((float(value) for value in discounts if isinstance(value, int | float)), None)
 

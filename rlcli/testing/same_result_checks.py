@@ -210,7 +210,7 @@ def speed(subject: TaskUnderTest) -> Iterator[Finding]:
         action = torch.zeros(count, env.layout.action_size)
         env.reset(seed=env.seed)
         env.step(action.clone())
-        env.step(action.clone())  # two steps for everything that is created lazily
+        env.step(action.clone())  # the first two steps create everything that is created lazily
         start = time.perf_counter()
         for _ in range(10):
             env.step(action.clone())

@@ -235,7 +235,7 @@ def write_checkpoint(checkpoints: Path, step: int, state: TrainerState, extra: M
             os.rename(temporary, target)
             sync_folder(checkpoints)
     finally:
-        shutil.rmtree(temporary, ignore_errors=True)  # it is left after an error only
+        shutil.rmtree(temporary, ignore_errors=True)  # the temporary folder still exists only after an error
     write_atomic(checkpoints / "latest", target.name + "\n")
     return target
 

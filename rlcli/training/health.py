@@ -205,7 +205,8 @@ def no_reward(health: Health) -> Found:
 
 def no_progress(health: Health) -> Found:
     """Report that neither return, reward terms, episode length nor values of success conditions have changed."""
-    if len(health.values(RETURN)) < _MIN_VALUES:  # few iterations end episodes if all of them end by time-out
+    # if all episodes end by time-out, few iterations have episodes that end
+    if len(health.values(RETURN)) < _MIN_VALUES:
         return
     watched = [RETURN, LENGTH, *health.names("Episode_Reward/"), *health.names("Success_Value/")]
     solved = max(health.values(SUCCESS), default=0.0) >= _SOLVED or health.is_above_start()
@@ -361,7 +362,7 @@ def blocked_success(health: Health) -> Found:
         gaps, states = _gaps(values, condition.model_dump()), health.values(f"Health/held/{name}")
         # the mean is near the bound, but no environment is within it in any of the states at the checks
         halved = _halved(gaps)
-        # an error that must be exactly 0
+        # the condition demands an error of exactly 0
         exact = bool(values) and condition.at_most is not None and condition.at_most <= 0.0 < min(values)
         unmet = not any(shares) and len(states) > 2 and not any(states)
         if (never and not _approaches(gaps)) or alone or (unmet and (halved or exact)):

@@ -95,7 +95,7 @@ class TensorBoard:
                 for file in sorted(folder.glob("events.out.tfevents.*")):
                     _remove_events_after(file, resume_after_step)
             self._file = (folder / name).open("wb")
-            # not SummaryWriter: its thread prints a traceback when the disk is full
+            # SummaryWriter is not used, because its thread prints a traceback when the disk is full
             self._event, self._writer = Event, RecordWriter(self._file)
             self._add(file_version="brain.Event:2")
 
@@ -149,7 +149,8 @@ def open_loggers(
     Raises:
         MachineError: if a logger cannot be opened.
     """
-    from rlcli.training.trackers import FailSafeLogger, open_tracker  # heavy; `check_loggers` does not need it
+    # imported here, because the import is slow and `check_loggers` does not need it
+    from rlcli.training.trackers import FailSafeLogger, open_tracker
 
     iteration, step = resume if resume is not None else (None, None)
     reached = None if resume is None else max(resume, _last_boundary(run.metrics))

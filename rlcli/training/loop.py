@@ -214,7 +214,7 @@ class TrainLoop:
         """Save a checkpoint of the state between two iterations, unless it exists."""
         boundary = self.trainer.iteration, self.trainer.env_steps
         if self.writer.newest != boundary:
-            state = self.trainer.state()  # collective: every rank must call it
+            state = self.trainer.state()  # a collective operation: every rank must call it
             if self._ranks.is_rank_zero:
                 self.writer.save(state, *boundary)
             else:

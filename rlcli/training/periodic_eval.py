@@ -67,7 +67,7 @@ class PeriodicEval:
                 self._env = self._make_env()
                 self._env.reset(seed=self._env.seed)
                 self._initial_state = self._env.state_dict()
-            # also resets curricula, so that each evaluation has the same episodes
+            # this also resets curricula, so that each evaluation has the same episodes
             self._env.load_state_dict(self._initial_state)
             seed_generators(self._env.seed)
             summary = evaluate(self._env, trained_policy(self._env, policy()), self._episodes).summary()

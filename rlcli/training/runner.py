@@ -104,7 +104,8 @@ def _train(job: Job, trainer: Trainer, env: Environment, stop: StopRequest, view
     trained_before = run.record.get("trained_s", 0.0)
 
     def close(state: str, reason: str | None = None) -> None:
-        with contextlib.ExitStack() as stack:  # closes all loggers even if one of them fails; then updates the run
+        # the stack closes all loggers even if one of them fails, then updates the run
+        with contextlib.ExitStack() as stack:
             end: dict[str, Any] = {"state": state, "reason": reason}
             if writer.written is not None:  # without a checkpoint the run has no step, and starts again
                 end["iteration"], end["step"] = writer.written
@@ -236,7 +237,7 @@ def _periodic_eval(job: Job, writer: CheckpointWriter, stop: StopRequest, iterat
 
     evaluator = PeriodicEval(make, episodes, interval, read_metrics(run.metrics), until)
     writer.best = evaluator.best if evaluator.best in steps(run.checkpoints) else None
-    # they differ if the run was killed before it wrote `best`, or is resumed from a step before its best evaluation
+    # the two differ if the run was killed before it wrote `best`, or is resumed from an earlier step
     if run.record.get("best") != writer.best:
         run.update(best=writer.best)
     return evaluator

@@ -73,7 +73,7 @@ class StopRequest(StepObserver):
             if self.signal is not None:
                 raise Interrupted
         except (KeyboardInterrupt, Exception) as error:
-            # an extension that is being imported may replace the interrupt by its own error
+            # an extension module that is being imported may replace the interrupt by an error of its own
             if self.signal is None and not isinstance(error, KeyboardInterrupt):
                 raise
             raise Stopped("stopped before training began", exit_code=self.exit_code) from None
@@ -92,7 +92,8 @@ class StopRequest(StepObserver):
             raise Interrupted
 
     def __enter__(self) -> StopRequest:
-        if threading.current_thread() is threading.main_thread():  # Python allows handlers only there
+        # Python allows signal handlers only in the main thread
+        if threading.current_thread() is threading.main_thread():
             for number in (getattr(signal, name) for name in _SIGNALS if hasattr(signal, name)):
                 if signal.getsignal(number) is not signal.SIG_IGN:
                     self._previous[number] = signal.signal(number, self._receive)

@@ -145,7 +145,7 @@ def prepare_run(folder: Path, request: TrainingRequest, changes: Sequence[str] =
             message = f"the folder {folder} has a run of a sweep with other settings"
             raise UsageError(message, hint="start a new sweep with another --name")
         return device
-    for file in ("config.yaml", "checkpoints"):  # left by a process that was killed while creating the run
+    for file in ("config.yaml", "checkpoints"):  # files of a process that was killed while it created the run
         path = folder / file
         shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
     record = run_record(request, resolved, device)
@@ -373,7 +373,7 @@ def _find_checkpoint(request: TrainingRequest) -> tuple[Run, Path | None, str]:
             run, why = find_run(request.resume, request.runs, task)
         except (CheckpointError, UsageError):
             run = None
-        # a run with a step in its record had checkpoints: without any it is damaged
+        # a run whose record has a step has had checkpoints: without any it is damaged
         if run is None or not run.checkpoints.is_dir() or steps(run.checkpoints) or "step" in run.record:
             raise
         return run, None, why

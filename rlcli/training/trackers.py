@@ -216,7 +216,7 @@ class MLflow:
     def __init__(self, run: Run, config: Mapping[str, Any], resume_id: str | None) -> None:
         _set_default_variables(
             MLFLOW_DISABLE_TELEMETRY="true",
-            MLFLOW_ALLOW_FILE_STORE="true",  # a database would need more packages
+            MLFLOW_ALLOW_FILE_STORE="true",  # the default, a database, would need more packages
             MLFLOW_HTTP_REQUEST_MAX_RETRIES="2",
             MLFLOW_HTTP_REQUEST_TIMEOUT="20",
         )
@@ -245,7 +245,7 @@ class MLflow:
     def _exists(self, run_id: str) -> bool:
         try:
             self._client.get_run(run_id)
-        except Exception:  # the server is another one, or its data was deleted
+        except Exception:  # it is another server, or the run's data was deleted there
             return False
         return True
 

@@ -240,7 +240,7 @@ class Bench:
         reason = self._too_large(num_envs)
         if reason is not None:
             return Stepped(num_envs, engine_threads, workers, left_out=reason)
-        torch.set_num_threads(1)  # as in a rollout
+        torch.set_num_threads(1)  # one thread, as in a rollout
         flags = {"scene.num_envs": num_envs, "sim.engine_threads": engine_threads, "scene.workers": workers}
         try:
             env = make_training_env(self._resolve(flags), seed=42, device="cpu")

@@ -165,7 +165,8 @@ def compare(
                     if stop.signal is not None:
                         break
                     training = _train(comparison, replace(base, seed=seed), arm, changes[arm], stop)
-                    if training.reached or training.error or stop.signal is None:  # else a signal stopped this training
+                    # otherwise a signal has stopped this training
+                    if training.reached or training.error or stop.signal is None:
                         comparison.trainings.append(training)
                     work.advance()
     if stop.signal is not None and len(comparison.trainings) < len(ARMS) * len(seeds):

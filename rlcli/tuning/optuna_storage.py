@@ -118,7 +118,7 @@ def _journal(folder: Path, create: bool) -> optuna.storages.BaseStorage:
     if not create and not file.is_file():
         raise CheckpointError(f"{folder} has no file {JOURNAL} with its trials; choose another --name for a new sweep")
 
-    lock: Any = FileLock(folder / f".{JOURNAL}")  # the system releases it when the process is killed
+    lock: Any = FileLock(folder / f".{JOURNAL}")  # the operating system releases the lock when the process is killed
 
     class Backend(JournalFileBackend):
         """Optuna's journal file. It repairs lines that a full disk cut short, and checks the file for damage."""

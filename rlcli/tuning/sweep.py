@@ -190,7 +190,7 @@ class Sweep:
                 lock = self._lock_trial(trial.number)
                 if lock is None:
                     continue
-                # another process may have ended it before the lock was taken
+                # another process may have ended this trial before the lock was taken
                 if any(other.number == trial.number for other in self.ended()):
                     lock.release()
                     continue

@@ -66,7 +66,7 @@ def refusal_reason(port: int, path: str, request_headers: Mapping[str, Sequence[
     site, mode, target = (
         (*request_headers.get(f"sec-fetch-{name}", ()), "")[0].lower() for name in ("site", "mode", "dest")
     )
-    # a link on another page may lead to ours: that request opens a new document and reveals nothing to the other page
+    # a click on a link of another page may open ours: that page learns nothing from the new document
     is_link = mode == "navigate" and target == "document" and route in ("/", "/index.html") and not is_websocket
     if site not in ("", "same-origin", "none") and not is_link:
         return "another page sent the request"

@@ -53,7 +53,7 @@ class RunCheckpoints:
             checkpoint = open_checkpoint(folder)
             policy = checkpoint.policy()
             require_fit(checkpoint, self.env.layout)
-        except OSError as error:  # training removed it while it was read
+        except OSError as error:  # the training has removed the checkpoint while it was read
             raise CheckpointError(f"{folder} cannot be read: {error.strerror or error}; choose another") from None
         generator = torch.Generator().manual_seed(self.seed)
         return trained_policy(self.env, policy, stochastic=self.stochastic, generator=generator)

@@ -69,7 +69,7 @@ class EnvGrid:
             model, data = self.env.world(number)
             begin = scene.ngeom
             mujoco.mjv_addGeoms(model, data, option, mujoco.MjvPerturb(), category, scene)
-            # backwards, so that the last geom, which replaces a removed one, was already moved
+            # from the end: a removed geom is replaced by the last one, which must have been moved before
             for index in range(scene.ngeom - 1, begin - 1, -1):
                 geom = scene.geoms[index]
                 if geom.type in _GROUND:

@@ -102,7 +102,7 @@ def _require_windows() -> None:
     Raises:
         MachineError: if the display cannot show a window.
     """
-    if sys.platform == "darwin":  # there only the main thread may open a window, and MuJoCo raises an error
+    if sys.platform == "darwin":  # on macOS only the main thread may open a window; MuJoCo raises an error otherwise
         return
     import glfw
 

@@ -89,7 +89,7 @@ class Renderer(contextlib.AbstractContextManager["Renderer"]):
         mujoco.mjr_render(self._rect, self._scene, self._mjr)
         pixels = np.empty((self._height, self._width, 3), np.uint8)
         mujoco.mjr_readPixels(pixels, None, self._rect, self._mjr)
-        return np.ascontiguousarray(pixels[::-1])  # OpenGL's first row is the lowest one
+        return np.ascontiguousarray(pixels[::-1])  # the first row of OpenGL is the lowest row of the image
 
     def __exit__(self, *_: object) -> None:
         self.close()

@@ -265,7 +265,7 @@ class Playback:
         pushed = before + torch.from_numpy(push).to(row)
         row.copy_(pushed)
         result = self.env.step(action)
-        row.copy_(torch.where(row == pushed, before, row))  # a reset writes other forces: they stay
+        row.copy_(torch.where(row == pushed, before, row))  # forces that a reset has written stay
         return result
 
     def _report(self, message: str) -> None:

@@ -108,6 +108,7 @@ def film_case(case: StagedCase, file: Path) -> tuple[int, float, str]:
     """Film the recorded last steps of a failed episode; return frames, frames per second and the OpenGL backend."""
     count = len(case.states)
     with open_video(case.staged.model, case.staged.resolved.task, file) as (renderer, writer, stride):
-        for number in range((count - 1) % stride, count, stride):  # this start includes the last state
+        # with this first index, the last state is among the filmed ones
+        for number in range((count - 1) % stride, count, stride):
             writer.add(renderer.draw(*case.forward(number)))
     return writer.frames, writer.fps, renderer.backend

@@ -59,7 +59,7 @@ def load() -> SimpleNamespace:
     for name, attributes in _REQUIRED_NAMES.items():
         try:
             module = importlib.import_module(f"mujoco.studio.{name}")
-        except Exception as error:  # a wheel without the viewer, or with another one, whose import may raise anything
+        except Exception as error:  # the wheel has no viewer, or another one whose import may raise any error
             raise incompatible_viewer(f"{type(error).__name__}: {error}") from None
         missing += [f"{name}.{attribute}" for attribute in attributes if not hasattr(module, attribute)]
         modules[name.rpartition(".")[2]] = module
@@ -87,7 +87,7 @@ def listen(port: int, socket_class: type[socket.socket] = socket.socket) -> sock
         MachineError: if the port is in use, or not allowed.
     """
     listener = socket_class(socket.AF_INET, socket.SOCK_STREAM)
-    if os.name == "posix":  # else the port stays in use for a minute after its server has ended
+    if os.name == "posix":  # otherwise the port stays in use for a minute after the server has ended
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listener.bind(("127.0.0.1", port))
@@ -242,7 +242,8 @@ def _quiet() -> Iterator[None]:
         handler.setStream(sys.stderr)
     loop.addFilter(_is_unexpected)
     viewer = logging.getLogger("mujoco.studio.viewer_protocol")
-    was_disabled, viewer.disabled = viewer.disabled, True  # its errors are raised, so they would be printed twice
+    # errors of the viewer are raised; without this line they would also be printed
+    was_disabled, viewer.disabled = viewer.disabled, True
     try:
         yield
     finally:

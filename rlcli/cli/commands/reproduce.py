@@ -46,7 +46,7 @@ def command(
     from rlcli.machine.processes import limit_openmp_spinning
     from rlcli.runs.run_ref import default_runs_dir, find_run
 
-    limit_openmp_spinning()  # as `rlcli train` does
+    limit_openmp_spinning()  # `rlcli train` also does this before it imports torch
     runs = runs_dir or default_runs_dir()
     original, why = find_run(reference, runs)
     console.info(f"reproducing {original.folder} ({why})")

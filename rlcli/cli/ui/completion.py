@@ -111,7 +111,7 @@ def _agents(task: str) -> list[str]:
 
     if not any(separator in task for separator in ("/", "\\")) and not (Path(task) / "task.yaml").is_file():
         entry = find_entry(TASKS, task, what="task")
-        if entry.distribution != OWN:  # reading its file imports the plugin, which is too slow for a key press
+        if entry.distribution != OWN:  # reading the task's file imports the plugin, which is too slow for a key press
             known = cached_details([entry]).get(entry.qualified)
             return [known.agent] if known and known.agent else []
     source = find_task(task)

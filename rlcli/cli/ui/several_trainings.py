@@ -107,7 +107,7 @@ def print_sweep(sweep: Sweep) -> None:
     if best is not None:
         run = documents[best.number]["run"] or "on the machine that trained it"
         console.info(f"best: trial {best.number}; its run: {run}")
-        source = settings["source"]  # a task of no package is named by its folder
+        source = settings["source"]  # a task that belongs to no package is named by its folder
         task = settings["task"] if source.get("distribution") else source.get("folder", settings["task"])
         console.info(f"to train with its settings: rlcli train {task} --config {file}")
     if (same := sweep.same_objective()) is not None:

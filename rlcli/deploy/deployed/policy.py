@@ -112,7 +112,7 @@ def _convolve_images(x):
 
 
 def _sigmoid(x):
-    small = np.exp(-np.abs(x))  # of -|x|, so that exp cannot overflow
+    small = np.exp(-np.abs(x))  # exp of -|x| cannot overflow
     return np.where(x >= 0, 1.0, small) / (1.0 + small)
 
 

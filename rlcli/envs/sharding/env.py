@@ -259,7 +259,7 @@ class ShardedEnv(Environment):
                 own = function(self.local, *arguments)
             except KeyboardInterrupt:
                 raise
-            except BaseException:  # else the next call would read this reply
+            except BaseException:  # otherwise the next call would read this reply
                 self._workers.replies()
                 raise
             values = self._workers.replies()

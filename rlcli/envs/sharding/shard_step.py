@@ -229,7 +229,8 @@ class ShardRunner:
         named += [*episodes.conditions.values(), *episodes.condition_values.values()]
         fixed = [episodes.ids, episodes.returns, episodes.lengths, episodes.truncated]
         values = [*fixed, *named, *([] if episodes.success is None else [episodes.success])]
-        for row, value in zip(self._episodes, values, strict=False):  # in numpy: its calls take a third of torch's time
+        # in numpy, because its calls take a third of the time of torch's
+        for row, value in zip(self._episodes, values, strict=False):
             row[:count] = value.numpy()
 
     def _pop_new_columns(self) -> Columns | None:

@@ -96,7 +96,7 @@ class _WarningSender(logging.Handler):
 
 
 def _serve(channel: Channel, arrays: int) -> None:
-    import torch  # imported while the main process builds its own shard
+    import torch  # torch is imported while the main process builds its own shard
 
     import rlcli.envs.managed
     import rlcli.envs.sharding.shard_step  # noqa: F401
@@ -160,7 +160,7 @@ class _Worker:
         self._number = job.number
         if job.has_own_code:
             self._check = _GlobalGenerators().require_unused
-        else:  # each operation takes a tenth less time; a task's own code might need gradients
+        else:  # inference mode takes a tenth of the time off each operation, but a task's own code might need gradients
             self._step_mode = torch.inference_mode
         import_again(job.files)
         resolved: Resolved = pickle.loads(job.resolved)

@@ -94,7 +94,7 @@ class Collector:
         rollout, samples, bound = self.rollout, self.rollout.samples, self.config.action_bound
         for name, state in self.hidden_state.items():
             self.initial_hidden_state[name].copy_(state)
-        # one call samples the noise of all steps: faster than a call per step
+        # one call that samples the noise of all steps is faster than a call in each step
         std, noise = self.networks.std, torch.randn_like(samples.action)
         deviation = std * noise
         samples.log_prob.copy_(log_prob(noise, std))
@@ -190,7 +190,7 @@ class Collector:
             self.require_finite_rollout()
         self.explained_variance.copy_(1.0 - (samples.target - value).var() / samples.target.var())
         if self.value_normalizer is not None:
-            # in this order: the old values are normalised before the targets enter the statistics
+            # in this order: the old values are normalised before the targets change the statistics
             for column in (samples.value, samples.target):
                 self._update_normalizer(self.value_normalizer, column.flatten())
                 column.copy_(self.value_normalizer(column))

@@ -95,7 +95,7 @@ class Learner:
             collector.estimate_advantages()
             collector.complete_images()
             if collector.normalizer is not None and self.config.normalizer_update == "rollout":
-                # after the advantages: the networks still see the observations as in the rollout
+                # after the advantages: they are computed with the normalisation that was used in the rollout
                 collector.update_normalizers(collector.raw_obs)
             self.optimize()
             self._write_metrics()

@@ -179,7 +179,7 @@ class Objective:
             change = value - old_value
             within = change.clamp(-limit, limit)
             clipped = old_value + within - self.batch.target[rows]
-            # within the range `clipped` equals `error` except for rounding and has its gradient; outside it is constant
+            # inside the range, `clipped` equals `error` up to rounding; outside, its gradient is 0
             gradient, square = torch.where(change == within, clipped, 0.0), clipped.square()
             if config.clip_value == "larger":
                 plain = error.square()

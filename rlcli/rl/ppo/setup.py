@@ -103,7 +103,7 @@ def minibatch_sizes(env: Environment, config: PpoConfig, total: int) -> list[int
         ConfigError: if the rollout has too few samples.
     """
     rollout = f"a rollout holds num_steps x num_envs = {config.num_steps} x {env.num_envs} = {total} samples"
-    whole = config.num_steps if config.rnn else 1  # samples that must stay in one minibatch
+    whole = config.num_steps if config.rnn else 1  # number of samples that must stay in one minibatch
     parts = torch.arange(total // whole)
     if config.minibatch_size is not None:
         split = torch.split(parts, max(1, config.minibatch_size // whole))

@@ -62,7 +62,7 @@ def make_model(env: Environment, config: Sb3Config, seed: int, device: str) -> A
     else:
         settings["replay_buffer_class"] = TorchReplayBuffer
     if isinstance(config, PpoConfig):
-        networks["optimizer_kwargs"]["eps"] = 1e-5  # as in SB3's on-policy policies
+        networks["optimizer_kwargs"]["eps"] = 1e-5  # the epsilon of SB3's on-policy policies
         settings["batch_size"] = config.n_steps * env.num_envs  # the buffer itself makes the minibatches
     settings |= {"seed": seed, "device": device, "policy_kwargs": networks}
     model: Any = algorithm(policy="MlpPolicy", env=Sb3VecEnv(env, config.action_bound), **settings)

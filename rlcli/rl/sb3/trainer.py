@@ -69,7 +69,8 @@ class Sb3Trainer(BaseTrainer):
         self.model.set_logger(Logger(folder=None, output_formats=[]))
         self.model._current_progress_remaining = 1.0
         self._learning_rate: float = config.learning_rate
-        self.model.lr_schedule = lambda _: self._learning_rate  # SB3's update sets its optimisers to this
+        # SB3's update sets the learning rate of its optimisers to this value
+        self.model.lr_schedule = lambda _: self._learning_rate
         self.model.source, self.model.statistics = env, self.statistics
         self.model.reward_scale, self.model.action_bound = config.reward_scale, config.action_bound
         self.normalizer = Normalizer(self.spec.observation_size) if config.normalize_observations else None

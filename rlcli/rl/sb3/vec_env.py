@@ -83,7 +83,7 @@ class Sb3VecEnv(Sb3Base):
         return self._seeds
 
     def _infos(self, result: StepResult) -> list[dict[str, Any]]:
-        infos = [self._empty_info] * self.num_envs  # one shared dict: most steps end no episode
+        infos = [self._empty_info] * self.num_envs  # all environments share one dict, because most steps end no episode
         if result.episodes is not None and result.final_obs is not None:
             final = result.final_obs["policy"].numpy()
             ended = result.episodes.ended()
