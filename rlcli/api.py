@@ -181,7 +181,7 @@ def load_policy(
         runs_dir: folder of the runs.
 
     Raises:
-        CheckpointError: if there is no such checkpoint, or it does not fit the environment.
+        CheckpointError: if there is no such checkpoint, or the checkpoint does not fit the environment.
     """
     saved = open_checkpoint(_find(checkpoint, env.resolved.source, runs_dir))
     require_fit(saved, env.layout)

@@ -192,7 +192,7 @@ def error_text(error: BaseException) -> str:
 
 
 def error_with_type(error: BaseException) -> str:
-    """Return the message of an error of rlcli; of any other error its class name and its message."""
+    """Return the message of an error; if the error is not one of rlcli, with its class name in front."""
     if isinstance(error, RlcliError):
         return error.message
     return ": ".join(filter(None, (type(error).__name__, error_text(error))))

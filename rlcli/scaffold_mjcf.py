@@ -21,7 +21,7 @@ from rlcli.scaffold_mjcf_copy import (
     put_robot_first,
     remove_scene_elements,
 )
-from rlcli.scene.joint_units import LARGEST_LIMIT, doubtful_limits
+from rlcli.scene.joint_unit_check import LARGEST_LIMIT, doubtful_limits
 from rlcli.scene.reachable_positions import coupled_joints, follow_coupled_joints, random_poses, reachable_positions
 
 _CONTROL_DT = 0.02
@@ -271,7 +271,7 @@ class Robot:
         return [self.body_name(b) for b in self._touching(-0.01) if self.model.body_weldid[b] != _ROOT]
 
     def trunk(self) -> list[str]:
-        """Return the names of the root and of the bodies that are fixed to it, if they have a geom."""
+        """Return the names of the bodies with geoms among the root and the bodies that are fixed to the root."""
         return [self.body_name(b) for b in dict.fromkeys(self.model.geom_bodyid) if self.model.body_weldid[b] == _ROOT]
 
     def _lower_to_ground(self) -> float:

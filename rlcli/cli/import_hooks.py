@@ -20,7 +20,7 @@ class AddressSpaceCheck:
 
     @staticmethod
     def find_spec(name: str, *_: object) -> None:
-        """Check the limit if the module is one of these libraries; return None, so that another finder finds it.
+        """Check the limit if the module is numpy, mujoco or torch; return None, so that Python's own finder finds it.
 
         Raises:
             MachineError: if the limit is too low for this library.

@@ -64,7 +64,7 @@ def given_settings(recorded: Mapping[str, Any], changes: Mapping[Path, Any]) -> 
 
 
 def recorded_models(task: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the models and gains in the configuration that a run has stored, in the form of `read_models`."""
+    """Return the models and gains that a run has stored in its configuration, in the form of `read_models`."""
     entities = (task.get("scene") or {}).get("entities") or {}
     return {
         name: {"model": entity["model"], "gains": entity.get("actuators") or {}}

@@ -32,7 +32,7 @@ def move_foreign_keys(data: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def merge_translation(layers: Layers, found: Translation, entry: Entry) -> None:
-    """Merge a task file that a format's plugin has translated into the layers of a configuration.
+    """Add the translation of another framework's task file to the layers of a configuration.
 
     Args:
         layers: the configuration so far.

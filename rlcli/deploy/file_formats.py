@@ -58,7 +58,7 @@ def require_packages(format_: str) -> None:
     """Check that the packages that write and check a file format are installed.
 
     Raises:
-        DependencyError: if one of them is not installed.
+        DependencyError: if one of these packages is not installed.
     """
     if format_ != "onnx":
         return
@@ -134,7 +134,7 @@ def require_self_contained(data: bytes, file: Path) -> None:
         file: its path, for the message.
 
     Raises:
-        CheckpointError: if it is not an ONNX file, or stores a tensor in another file.
+        CheckpointError: if `data` is not an ONNX file, or stores a tensor in another file.
     """
     import onnx
     from google.protobuf.message import DecodeError

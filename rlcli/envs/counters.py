@@ -66,7 +66,7 @@ class SuccessCondition:
         return f"{self.name}{bound}: " + (f"has held for {held:.1f} s" if held else "fails")
 
     def count(self) -> None:
-        """Add 1 to the number of consecutive steps where the condition holds, and set it to 0 where it does not."""
+        """Update the number of consecutive steps in which the condition holds: add 1, or set it to 0."""
         self.field += 1.0
         self.field *= self.holds()
 

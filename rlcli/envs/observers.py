@@ -29,7 +29,7 @@ class StepObserver:
         """Run on the state from which rewards and terminations are computed, before any reset."""
 
     def on_divergence(self, found: list[Divergence], pending: bool) -> None:
-        """Run when simulations have diverged, before a reset drops the calls that `engine.recorded_calls` returns.
+        """Run when simulations have diverged, before a reset deletes the recorded engine calls.
 
         Args:
             found: environment and cause of the first few divergences (`rlcli.sim.divergence_report.Divergence`).

@@ -102,7 +102,7 @@ def _plugin_points(distribution: metadata.Distribution) -> dict[str, list[metada
     """Return the entry points of a distribution in each group of plugins.
 
     Raises:
-        ValueError: if it has more than `MAX_ENTRIES`; other errors for malformed metadata.
+        ValueError: if the distribution has more than `MAX_ENTRIES`; other errors for malformed metadata.
     """
     found: dict[str, list[metadata.EntryPoint]] = {group: [] for group in GROUPS}
     for point in _entry_points(distribution):

@@ -87,7 +87,7 @@ def require_end(env: Environment, length: int) -> None:
     """Check that an episode, which has had `length` steps so far, is not much longer than episode_length_s.
 
     Raises:
-        ConfigError: if it is much longer, because the task has no time-out.
+        ConfigError: if the episode is much longer, because the task has no time-out.
     """
     if length > PATIENCE * env.max_episode_length:
         message = f"an episode has lasted {length} steps, {PATIENCE} times episode_length_s, and has not ended"

@@ -339,7 +339,7 @@ def read_trajectory(file: Path) -> Trajectory:
     """Read and check a trajectory file.
 
     Raises:
-        CheckpointError: if it is missing, corrupt or of another format.
+        CheckpointError: if the file is missing, corrupt or of another format.
     """
     try:
         if file.exists() and not file.is_file():

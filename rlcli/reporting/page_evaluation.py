@@ -114,7 +114,7 @@ class PageMedia:
         """Return the content of a video file of the run; None if the file does not exist.
 
         Raises:
-            CheckpointError: if it is not an MP4, is outside the run's folder, or is too large for a page.
+            CheckpointError: if the file is not an MP4, is outside the run's folder, or is too large for a page.
         """
         try:
             with read_errors(file):

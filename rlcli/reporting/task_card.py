@@ -382,8 +382,8 @@ def _meaning(section: str, config: TermConfig, vocabulary: Vocabulary) -> tuple[
 def _parameters(section: str, config: TermConfig, vocabulary: Vocabulary) -> str:
     """Return a term's parameters as text, such as `std` = 0.5.
 
-    Left out are selectors of joints, bodies or other elements that match all of them (`.*`), and defaults of parameters
-    that name an entity, command or sensor, unless the term's docstring mentions the parameter.
+    The text does not contain selectors that match all joints, bodies or other elements (`.*`). It contains a default
+    value that names an entity, command or sensor only if the term's docstring mentions the parameter.
     """
     signature = vocabulary.find(section, config.func)
     parameters = {p.name: p for p in signature.parameters} if signature else {}

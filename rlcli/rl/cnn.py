@@ -43,7 +43,7 @@ class CnnSpec(BaseModel):
     pictures: Annotated[list[ImageSpec], Field(min_length=1, max_length=16)]
     """Images of the observation, sorted by their first column; their columns must not overlap."""
     channels: Annotated[list[_Size], Field(min_length=1, max_length=16)]
-    """Output channels of each layer."""
+    """Number of output channels of each layer."""
     kernels: list[_Size]
     """Kernel size of each layer (square) [pixels]."""
     strides: list[_Size]

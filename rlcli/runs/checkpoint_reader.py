@@ -311,7 +311,7 @@ def open_checkpoint(folder: Path) -> Checkpoint:
 
     Raises:
         CheckpointError: if the checkpoint is missing, incomplete or corrupt.
-        FormatError: if it has a format that this rlcli does not read.
+        FormatError: if the checkpoint has a format that this rlcli does not read.
     """
     file = folder / "manifest.json"
     data = read_file(file, JSON_LIMIT, missing=f"{folder} is not a checkpoint: it has no manifest.json; check the path")

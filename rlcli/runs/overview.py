@@ -102,7 +102,7 @@ def overview_of(run: Run) -> Overview:
         state,
         reason,
         resumable=state != "running" and _resumable(run),
-        iterations=count(record.get("iterations")),
+        iterations=as_count(record.get("iterations")),
         started=record.get("started"),
         size_bytes=_size(run.folder),
         agent=record.get("agent"),
@@ -115,7 +115,8 @@ def overview_of(run: Run) -> Overview:
         overview.last = _score(row, "Train/")
         if overview.last:  # in some iterations no episode ends
             break
-    overview.iteration, overview.step = (count(newest.get(key, record.get(key))) or 0 for key in ("iteration", "step"))
+    overview.iteration = as_count(newest.get("iteration", record.get("iteration"))) or 0
+    overview.step = as_count(newest.get("step", record.get("step"))) or 0
     if state == "finished" and overview.iterations is None:
         overview.iterations = overview.iteration
     best = record.get("best")
@@ -183,7 +184,7 @@ def _is_new(folder: Path) -> bool:
 
 def _row(line: bytes) -> dict[str, Any] | None:
     row = parse_row(line)
-    if row is None or any(count(row[key]) is None for key in ("iteration", "step")):
+    if row is None or any(as_count(row[key]) is None for key in ("iteration", "step")):
         return None
     return row
 
@@ -221,8 +222,8 @@ def _evaluation(run: Run) -> dict[str, Any]:
     return {}
 
 
-def count(value: object) -> int | None:
-    """Return a value of untrusted JSON if it is an integer from 0 to 2**63 - 1; else None."""
+def as_count(value: object) -> int | None:
+    """Return a value of untrusted JSON as a number of steps or iterations; None if it is no integer >= 0, < 2**63."""
     return value if type(value) is int and 0 <= value < 2**63 else None
 
 

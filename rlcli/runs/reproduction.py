@@ -23,7 +23,7 @@ def require_reproducible(run: Run) -> None:
     """Check that a run can be reproduced bit by bit: it was trained by one process on a CPU.
 
     Raises:
-        UsageError: if it was not, or has no finished iteration.
+        UsageError: if the run was trained in another way, or has no finished iteration.
     """
     device, processes = str(run.record.get("device", "cpu")), run.record.get("processes", 1)
     if device != "cpu":

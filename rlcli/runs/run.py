@@ -84,7 +84,7 @@ class Run:
         """Read the resolved configuration.
 
         Raises:
-            CheckpointError: if it is missing, corrupt, or not a regular file.
+            CheckpointError: if the file is missing, corrupt, or not a regular file.
         """
         text = read_file(
             self.config, strict_yaml.MAX_BYTES, missing=f"{self.folder} has no {CONFIG}; choose another run"
@@ -167,7 +167,7 @@ def require_name(name: str | None) -> None:
     """Check that a name can be part of a folder's name.
 
     Raises:
-        UsageError: if it cannot.
+        UsageError: if the name is not allowed.
     """
     if name is not None and not _NAME.fullmatch(name):
         hint = "begin with a letter or digit; then letters, digits, '.', '-' and '_' are allowed"

@@ -55,7 +55,7 @@ class RunLock:
         It is another one if the file was deleted, or if the folder was moved away and another folder is in its place.
 
         Raises:
-            MachineError: if it is another file: a second process could then lock the folder, too.
+            MachineError: if the lock file is another one: a second process could then lock the folder, too.
             OSError: if the folder does not exist any more.
         """
         try:
@@ -76,10 +76,10 @@ _held: WeakValueDictionary[Path, RunLock] = WeakValueDictionary()
 
 
 def require_locks(path: Path) -> None:
-    """Check that this process still holds the locks that it has taken of the folders above a path.
+    """Check that this process still holds its locks of the folders that contain a path.
 
     Raises:
-        MachineError: if it has lost one.
+        MachineError: if this process has lost a lock.
         OSError: if such a folder does not exist any more.
     """
     for folder, lock in list(_held.items()):

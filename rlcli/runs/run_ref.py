@@ -28,7 +28,7 @@ def find_run(reference: str, runs_dir: Path, task: str | None = None) -> tuple[R
 
     Raises:
         CheckpointError: if there is no such run.
-        UsageError: if it is a run of another task than `task`.
+        UsageError: if the run is of another task than `task`.
     """
     run, why = _find_run(reference, runs_dir, task)
     if task is not None and run.record["task"]["name"] != task:

@@ -103,8 +103,8 @@ def read_file(file: Path, limit: int, *, size: int | None = None, missing: str |
         missing: message of the error if the file does not exist; None: a FileNotFoundError.
 
     Raises:
-        CheckpointError: if it is a link, not a regular file, too large or of another size, or cannot be read.
-        FileNotFoundError: if it does not exist.
+        CheckpointError: if the file is a link, not a regular file, too large or of another size, or cannot be read.
+        FileNotFoundError: if the file does not exist.
     """
     try:
         with _opened(file) as (opened, found):
@@ -131,8 +131,8 @@ def read_tail(file: Path, limit: int) -> tuple[bytes, bool]:
         The bytes, and whether they are the whole file.
 
     Raises:
-        CheckpointError: if it is a link, not a regular file, or cannot be read.
-        FileNotFoundError: if it does not exist.
+        CheckpointError: if the file is a link, not a regular file, or cannot be read.
+        FileNotFoundError: if the file does not exist.
     """
     with _opened(file) as (opened, size):
         begin = max(0, size - limit)
@@ -146,7 +146,7 @@ def _opened(file: Path) -> Iterator[tuple[BinaryIO, int]]:
 
     Raises:
         CheckpointError: with the name of the file, if it is a link or no regular file, or for an error in the block.
-        FileNotFoundError: if it does not exist.
+        FileNotFoundError: if the file does not exist.
     """
     try:
         if file.is_symlink():
@@ -203,7 +203,7 @@ def read_json(folder: Path, name: str, limit: int = JSON_LIMIT, *, missing: str 
 
     Raises:
         CheckpointError: if the file cannot be read, or is not a JSON object.
-        FileNotFoundError: if it does not exist.
+        FileNotFoundError: if the file does not exist.
     """
     file = folder / name
     with read_errors(file):

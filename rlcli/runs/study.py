@@ -114,7 +114,7 @@ def runs_of(folder: Path, record: Mapping[str, Any]) -> list[Path]:
     """Return the folders of a study's runs. `record` is the content of study.json.
 
     Raises:
-        CheckpointError: if it names a run that is not `seed-N`.
+        CheckpointError: if the record names a run that is not `seed-N`.
     """
     names = check_json(_StudyRuns, record, folder / STUDY).runs
     return [folder / name for name in names]

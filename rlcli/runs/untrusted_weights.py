@@ -34,7 +34,7 @@ def read_archive_file(file: Path) -> bytes:
     """Read a whole file.
 
     Raises:
-        CheckpointError: if there is no such file, or it is larger than 4 GiB or a quarter of the memory.
+        CheckpointError: if there is no such file, or the file is larger than 4 GiB or a quarter of the memory.
     """
     limit = min(_MAX_BYTES, available_memory() // 4)
     return read_file(file.resolve(), limit, missing=f"there is no file {file}; check the path")

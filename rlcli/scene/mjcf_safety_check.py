@@ -140,7 +140,7 @@ class MjcfScan:
         """Check a cost of this model.
 
         Raises:
-            BadModel: if it is too high.
+            BadModel: if the cost is too high.
         """
         if self.limited and cost > MAX_COST:
             raise BadModel(

@@ -116,7 +116,8 @@ class ContactSensor(TensorState):
 
         `sensordata` has the readings of all MJCF sensors. (rows, nsensordata)
         """
-        values = torch.unflatten(sensordata[:, self._columns], 1, (-1, self._others, 4))  # count, force
+        # a reading is the number of contacts, then the force
+        values = torch.unflatten(sensordata[:, self._columns], 1, (-1, self._others, 4))
         total = values[:, :, 0]
         for other in range(1, self._others):
             total = total + values[:, :, other]

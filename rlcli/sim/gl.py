@@ -104,7 +104,7 @@ def candidates() -> list[str]:
 
 
 def _unload_opengl() -> None:
-    """Remove PyOpenGL from the imported modules, to import it again for another backend: it is fixed at import."""
+    """Remove PyOpenGL from the imported modules, so that it can be imported for another backend."""
     os.environ.pop("PYOPENGL_PLATFORM", None)
     backends = ("mujoco.egl", "mujoco.osmesa", "mujoco.glfw")
     for name in [name for name in sys.modules if name.partition(".")[0] == "OpenGL" or name in backends]:

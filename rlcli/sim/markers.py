@@ -13,9 +13,9 @@ from torch import Tensor
 Color: TypeAlias = tuple[float, float, float, float]
 """Red, green, blue and opacity, each from 0 to 1."""
 COMMANDED: Color = (0.1, 0.9, 0.1, 1.0)
-"""Green, for commanded values."""
+"""Colour of markers for commanded values: green."""
 ACTUAL: Color = (0.1, 0.3, 1.0, 1.0)
-"""Blue, for actual values."""
+"""Colour of markers for actual values: blue."""
 
 
 class Arrow(NamedTuple):

@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterator
 
 from rlcli.config.layers import leaves
-from rlcli.scene.joint_units import doubtful_limits
+from rlcli.scene.joint_unit_check import doubtful_limits
 from rlcli.testing.fixed_policy_rollouts import RolloutEvidence
 from rlcli.testing.remarks import Remark, warning_at
 

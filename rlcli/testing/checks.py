@@ -75,7 +75,7 @@ def check_task(
     Raises:
         UsageError: for a check that does not exist, or fewer than 8 environments.
         ConfigError: if the files are not valid; `rlcli validate` prints the same errors.
-        TaskError: if there is no such task, or it cannot be imported.
+        TaskError: if there is no such task, or the task cannot be imported.
     """
     for name in only:
         require_known(name, list(CHECKS), "check", "checks")
@@ -114,7 +114,7 @@ def record_layout(
 
     Raises:
         ConfigError: if the task is not valid.
-        TaskError: if there is no such task, or it cannot be imported.
+        TaskError: if there is no such task, or the task cannot be imported.
     """
     subject = open_task(task, agent, overrides, config, NUM_ENVS, 0)
     record, file = subject.env().layout.record(), same_result_checks.layout_file(subject)

@@ -59,7 +59,7 @@ def lint_task(
     Raises:
         UsageError: for a rule that does not exist, or fewer than 8 environments.
         ConfigError: if the task is not valid; `rlcli validate --deep` prints the same errors.
-        TaskError: if there is no such task, or it cannot be imported.
+        TaskError: if there is no such task, or the task cannot be imported.
     """
     for name in (*only, *ignore):
         require_known(name, list(RULES), "rule", "rules")

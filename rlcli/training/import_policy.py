@@ -197,7 +197,7 @@ def _named_tensors(saved: object, where: str) -> dict[str, Tensor]:
             f"{where} has no weights in model_state_dict or actor_state_dict; give a file model_N.pt of RSL-RL"
         )
     named: dict[str, Tensor] = {}
-    total, limit = 0, available_memory() // 4  # bytes
+    total, limit = 0, available_memory() // 4  # [bytes]
     for name, value in saved.items():
         if not isinstance(name, str) or type(value) not in (Tensor, torch.nn.Parameter):
             raise CheckpointError(

@@ -110,7 +110,7 @@ class BackgroundTracker:
         """Close the tracker and wait until everything is written.
 
         Raises:
-            TimeoutError: if that takes longer than `_TIMEOUT_S`.
+            TimeoutError: if closing takes longer than `_TIMEOUT_S`.
         """
         with _without_stdout():
             self._rows.put(state)

@@ -358,8 +358,8 @@ class Bench:
         self.findings.present, self.findings.recommended = present, best if better else present
 
 
-def load() -> float | None:
-    """Return the system's load, the mean number of running processes in the last minute; None if it is unknown."""
+def system_load() -> float | None:
+    """Return the mean number of running processes in the last minute (the system's load); None if it is unknown."""
     with contextlib.suppress(AttributeError, OSError):
         return os.getloadavg()[0]
     return None

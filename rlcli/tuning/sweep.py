@@ -78,7 +78,7 @@ class _TrialNotes(FileModel):
 
 
 class _FinishedTrial(_TrialNotes):
-    """Entries of a finished trial: those of `Sweep.tell`, and the value of the objective."""
+    """Entries that Optuna's storage has for a finished trial: its notes, and the value of the objective."""
 
     values: tuple[float]
 
@@ -330,7 +330,7 @@ def read_sweep(folder: Path, storage: str | None = None) -> Sweep:
     """Open an existing sweep for reading.
 
     Raises:
-        CheckpointError: if it does not exist or is damaged.
+        CheckpointError: if the sweep does not exist or is damaged.
         MachineError: if its storage cannot be reached.
     """
     settings = _read_record(folder)

@@ -49,7 +49,7 @@ _REQUEST_S = 10.0
 """Time after which the server closes a connection without a complete request [s]."""
 
 
-def load() -> SimpleNamespace:
+def import_web_viewer() -> SimpleNamespace:
     """Import MuJoCo's web viewer; return its modules by the last part of their names.
 
     Raises:
@@ -107,7 +107,7 @@ def secured_server(studio: SimpleNamespace, listener: socket.socket) -> Iterator
     A viewer that starts in the block listens on `listener`, refuses requests of other pages, and prints nothing.
 
     Args:
-        studio: the viewer's modules, from `load`.
+        studio: the viewer's modules, from `import_web_viewer`.
         listener: a listening socket, from `listen`.
     """
     server, viewer = studio.web_server, studio.web_viewer
@@ -231,9 +231,9 @@ def _is_own_socket(peer: object) -> bool:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Send the warnings of MuJoCo's web viewer to stderr in a `with` block, and drop its other messages.
+    """Send the warnings of MuJoCo's web viewer to stderr in a `with` block, and discard its other messages.
 
-    Dropped are also errors of connections that a browser closes.
+    Errors of connections that a browser closes are discarded, too.
     """
     log, loop = logging.getLogger("WebServer"), logging.getLogger("asyncio")
     level, streams = log.level, [(h, h.stream) for h in log.handlers if isinstance(h, logging.StreamHandler)]

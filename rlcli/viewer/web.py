@@ -19,7 +19,13 @@ from rlcli.viewer.env_grid import EnvGrid
 from rlcli.viewer.offscreen import free_camera
 from rlcli.viewer.playback import Playback, run_in_real_time
 from rlcli.viewer.protocol import Ready
-from rlcli.viewer.secured_web_server import incompatible_viewer, listen, load, secured_server, verify_refusals
+from rlcli.viewer.secured_web_server import (
+    import_web_viewer,
+    incompatible_viewer,
+    listen,
+    secured_server,
+    verify_refusals,
+)
 
 _VISIBLE_FIELDS = (
     *("geom_size", "geom_pos", "geom_quat", "geom_rgba", "geom_type", "geom_dataid", "geom_matid", "mat_", "light_"),
@@ -35,7 +41,7 @@ def run(playback: Playback, *, title: str, num_drawn: int = 1, port: int, ready:
         DependencyError: if the installed MuJoCo has another web viewer or none.
         MachineError: if the port is in use.
     """
-    studio = load()
+    studio = import_web_viewer()
     with listen(port) as listener, secured_server(studio, listener):
         port = listener.getsockname()[1]
         viewer = _ViewerThread(studio, playback, title, num_drawn)

@@ -189,9 +189,9 @@ def _machine(resolved: Resolved) -> dict[str, Any]:
     from rlcli.machine.memory import available_memory
     from rlcli.machine.processor import processor
     from rlcli.runs.provenance import versions
-    from rlcli.tuning.bench import load
+    from rlcli.tuning.bench import system_load
 
-    cores, busy = available_cores(), load()
+    cores, busy = available_cores(), system_load()
     if busy is not None and busy > _MAX_LOAD * cores:
         console.warn(f"the machine is busy (load {busy:.1f} on {cores} cores): end other programs")
     return {

@@ -119,7 +119,7 @@ def _open_reference(choice: Choice, saved: Checkpoint, file: Path, task: str | N
     except TaskError as error:
         if choice.run is None or error.message != f"no task '{task}'":
             raise
-        hint = f"the run of {task} names its task: rlcli export --checkpoint {choice.run.folder} --verify"
+        hint = f"leave out the task, which the run names: rlcli export --checkpoint {choice.run.folder} --verify"
         raise TaskError(error.message, hint=hint) from None
     return open_reference(choice, saved, named)
 

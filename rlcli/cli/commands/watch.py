@@ -73,13 +73,13 @@ def _follow(run: Run) -> Overview:
 
 
 def _progress(run: Run) -> Progress | None:
-    from rlcli.runs.overview import count, newest_rows
+    from rlcli.runs.overview import as_count, newest_rows
     from rlcli.training.progress import progress_from_metrics
 
     rows = newest_rows(run)
     if not rows:
         return None
-    progress = progress_from_metrics(rows, count(run.record.get("iterations")))
+    progress = progress_from_metrics(rows, as_count(run.record.get("iterations")))
     progress.notes = run.findings()
     return progress
 
