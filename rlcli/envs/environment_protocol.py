@@ -46,7 +46,7 @@ class Environment(Protocol):
     final_obs_of: str
     """Which episodes have valid rows in `StepResult.final_obs`: `finished` (all that ended), or only `truncated`."""
     seconds: dict[str, float]
-    """Time spent in steps, and in their physics, since the start [s]."""
+    """Time spent since the start [s]: `step` (whole environment steps) and `physics` (the physics in them)."""
     observers: Observers
     """Objects that are called at fixed points of each step, such as recorders."""
     episode_length_buf: Tensor

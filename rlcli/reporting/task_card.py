@@ -64,7 +64,7 @@ class Card:
     summary: str
     """One line on what the policy does."""
     facts: tuple[tuple[str, str], ...]
-    """(name, value) of single values, such as the control period."""
+    """Facts that need no table, such as the control period: (name, value)."""
     tables: tuple[Table, ...]
     """One table for each section of the task: observations, actions, rewards, ..."""
 

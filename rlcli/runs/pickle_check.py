@@ -94,7 +94,7 @@ class _Simulation:
                 stack.append(_result(function.kind, arguments))
             case "BINPERSID":  # BINPERSID makes a storage: torch uses an item of this tuple as the key of a dictionary
                 if stack.pop().depth > 1:
-                    raise _RefusedError("has a tensor whose storage has no simple name")
+                    raise _RefusedError("has a tensor whose storage is named by something else than text")
                 stack.append(_Value())
             case "BINPUT" | "LONG_BINPUT":
                 self.memo[argument] = stack[-1]

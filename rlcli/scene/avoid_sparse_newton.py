@@ -17,7 +17,7 @@ _log = logging.getLogger(__name__)
 
 _VERSION = "4.0.0"
 _AUTO_SPARSE = 60
-"""Degrees of freedom from which MuJoCo's `jacobian="auto"` is sparse."""
+"""Number of degrees of freedom from which MuJoCo's `jacobian="auto"` is sparse."""
 
 
 def avoid_sparse_newton(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:

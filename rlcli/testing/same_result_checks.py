@@ -40,7 +40,7 @@ from rlcli.testing.task_under_test import TaskUnderTest, element_names, task_of
 STEPS = 16
 """Number of steps of a compared trajectory."""
 EPISODE = 12
-"""Steps of an episode, so that episodes end within the `STEPS`."""
+"""Length of an episode in these checks [steps]; it is below `STEPS`, so that episodes end within a trajectory."""
 
 
 def threads(subject: TaskUnderTest) -> Iterator[Finding]:

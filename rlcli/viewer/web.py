@@ -51,7 +51,8 @@ def run(playback: Playback, *, title: str, num_drawn: int = 1, port: int, ready:
             instructions = [f"open http://127.0.0.1:{port}/ in a browser on this machine; Ctrl-C ends the viewer"]
             tunnel = ssh_tunnel_command(port)
             if tunnel is not None:
-                instructions.append(f"on the machine of your SSH client: {tunnel}, then open http://localhost:{port}/")
+                there = f"run {tunnel} there, then open http://localhost:{port}/"
+                instructions.append(f"on the machine from which you connect by SSH: {there}")
             ready(instructions, f"http://127.0.0.1:{port}/")
             run_in_real_time(playback, viewer.is_open, viewer.send)
             viewer.raise_error()

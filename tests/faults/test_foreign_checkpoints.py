@@ -689,7 +689,7 @@ COSTLY = {
     "a large number as a key": (b"}\x8a\x08" + b"\xff" * 7 + b"\x1fNs.", "neither text nor a whole number"),
     "keys of an OrderedDict's arguments": (b"ccollections\nOrderedDict\n]]N\x85aNaa\x85R.", "calls something"),
     "a storage of a wanted size": (STORAGE + b"\x8a\x05\x00\x00\x00\x00\x7f\x85R.", "calls something"),
-    "a storage with tuples as its name": (b"(X\x07\x00\x00\x00storage" + STORAGE + b"N\x85\x85NNtQ.", "no simple name"),
+    "a storage with tuples as its name": (b"(X\x07\x00\x00\x00storage" + STORAGE + b"N\x85\x85NNtQ.", "else than text"),
     "attributes from a list": (b"ccollections\nOrderedDict\n)R]b.", "sets attributes"),
 }
 """Pickle of plain values that takes very long or much memory to load, or crashes Python -> part of the error."""

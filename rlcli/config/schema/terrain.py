@@ -165,7 +165,8 @@ class TerrainGeneratorConfig(StrictModel):
     curriculum: bool = True
     """true: one kind of ground for each column, difficulty by row; false: both are drawn for each patch."""
     max_start_level: Annotated[int, Field(ge=0)] | None = None
-    """Highest level (row of the grid, from 0) at which environments start; each draws its level. null: the last one."""
+    """Highest level (row of the grid, from 0) at which environments start; each environment draws its level. null: the
+    last level."""
     seed: int = 0
     """Seed of the terrain's random heights."""
     friction: NotNegative = 1.0
