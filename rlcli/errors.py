@@ -183,7 +183,7 @@ _MAX_ERROR_TEXT = 20_000
 def error_text(error: BaseException) -> str:
     """Return the message of an error, cut to `_MAX_ERROR_TEXT` characters.
 
-    If its `__str__` raises, as that of a task's class may, say so instead.
+    If the error's `__str__` itself raises, as in a broken class of a task, return a text that says so.
     """
     try:
         return str(error)[:_MAX_ERROR_TEXT]

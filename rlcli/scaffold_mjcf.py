@@ -49,7 +49,7 @@ class Robot:
         }
         home = default_pose(spec)
         self.has_pose = home is not None
-        """Whether the file has a default pose. Without one, joints are at zero, unless a limit is near or beyond it."""
+        """Whether the file has a default pose. If not, joints are at zero, or beside zero where a limit is near it."""
         remove_scene_elements(spec)
         original = spec.compile()
         tree = ElementTree.fromstring(spec.to_xml())

@@ -212,7 +212,7 @@ def extensions(source: TaskSource) -> tuple[Vocabulary, type[BaseModel] | None]:
     """Return the parts of a task file that depend on the task: its terms, and the parameters of a direct task.
 
     Returns:
-        The terms that the file may name (those of `rlcli.mdp` and the task's own), and the pydantic model of `params`;
+        The terms that the file may name (built-in terms and the task's own), and the pydantic model of `params`;
         None instead of the model for a manager-based task, and for a direct task without parameters.
 
     Raises:

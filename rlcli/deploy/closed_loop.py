@@ -346,7 +346,7 @@ class _PlainMujocoRunner:
     def _synchronize_states(self) -> None:
         """Set plain MuJoCo and the engine to the same state after a step of both.
 
-        If their states agree within rounding, both get the engine's state; otherwise both get that of plain MuJoCo.
+        If the states agree within rounding, both get the engine's state; else both get the state of plain MuJoCo.
         """
         disagreeing = []
         for i, data in enumerate(self._datas):
@@ -442,7 +442,7 @@ def _control_bounds(controller: Any, model: mujoco.MjModel) -> tuple[np.ndarray,
 
 
 def _reads_only_command(formula: Any) -> bool:
-    """Return whether a formula of the metadata depends on nothing but the policy's output `command`."""
+    """Return whether a formula of the metadata depends only on the policy's output `command`."""
     if isinstance(formula, list):
         return True
     if "op" in formula:

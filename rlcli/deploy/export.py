@@ -47,7 +47,7 @@ class Exported:
     observations: int
     """Number of test observations, on which the outputs of the file and of the policy were compared."""
     max_difference: float
-    """Largest difference of an output from that of the policy, relative to max(1, |value|)."""
+    """Largest difference between an output of the file and of the policy, relative to max(1, |value|)."""
 
 
 def check_target(format_: str, output: Path | None) -> None:

@@ -37,7 +37,7 @@ _OPEN = {
         self.policy = lambda x: {name: value.detach().numpy() for name, value in program(*tensors(x)).items()}
 """,
 }
-"""Format -> lines of `Controller.__init__` that open a policy file; the template has those of onnx."""
+"""Format -> lines of `Controller.__init__` that open a policy file; the template contains the lines for onnx."""
 _STANDARD = "import json\nimport sys\nfrom pathlib import Path\n\nimport mujoco\nimport numpy as np\n"
 _IMPORTS = {
     "onnx": f"{_STANDARD}import onnxruntime\n",

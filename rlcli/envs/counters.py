@@ -77,7 +77,7 @@ class EpisodeCounters(TensorState):
     def __init__(self, shard: Shard, device: torch.device) -> None:
         num_envs = shard.count
         self.ids = torch.arange(shard.first, shard.first + num_envs, device=device)
-        """Indices of these environments among those of all processes. (num_envs,) int64"""
+        """Indices of these environments in the environments of all processes. (num_envs,) int64"""
         memory = shard.counters
         if memory is None:
             memory = torch.empty(2, num_envs, dtype=torch.int64, device=device)

@@ -19,7 +19,7 @@ class TermLayout:
     elements: tuple[str, ...] = ()
     unit: str = ""
     scale: tuple[float, ...] | None = None
-    """Factor of each column; None: no scale, or an action that the task scales by code of its own."""
+    """Factor of each column; None: no scale, or the task's own code scales the action."""
     clip: tuple[float, float] | tuple[tuple[float, float], ...] | None = None
     """Limits of the columns.
 

@@ -203,7 +203,7 @@ class _MirrorTest:
         env.sim.forward_moved()
 
     def _compare_motion(self, before: Tensor) -> None:
-        """Compare the changes of the joint velocities with those of the mirror images. before (num_envs, nv)"""
+        """Compare the changes of the joint velocities with the changes in the mirror images. before (num_envs, nv)"""
         env, model = self._env, self._env.engine.model
         qpos, qvel = (env.engine.field(name) for name in ("qpos", "qvel"))
         image_qpos, image = qpos[_PAIRS:].clone(), qvel[_PAIRS:].clone()

@@ -145,7 +145,7 @@ class VecEnv(Workflow):
         4. Terminations, rewards and the conditions of success are computed.
         5. Final observations and `Episodes` of the episodes that end are computed.
         6. Observers run `on_step`.
-        7. Environments whose episode ended, and those of `restart`, are reset.
+        7. Environments whose episode ended, and the environments in `restart`, are reset.
         8. Commands and interval events run. Environments that they or a reset put out of bounds return to a good state;
            their episode ends with the next step.
         9. Observations are computed.

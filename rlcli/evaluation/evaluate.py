@@ -193,7 +193,7 @@ class _EpisodeMeans(StepObserver):
 
 
 def _add_episodes(result: Evaluation, ended: Episodes, quota: Tensor, means: _EpisodeMeans) -> None:
-    """Add the episodes that have just ended to a result, without those of environments that have run enough episodes.
+    """Add the episodes that have just ended to a result; skip environments that have run enough episodes.
 
     Args:
         result: the evaluation.

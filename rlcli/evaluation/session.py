@@ -51,7 +51,7 @@ class PolicyRequest:
     min_envs: int = 1
     """Smallest number of environments."""
     usual_envs: int | None = None
-    """Number of environments if neither the user nor the task's `play:` sets it; None: that of the training."""
+    """Number of environments if neither the user nor the task's `play:` sets it; None: as in the training."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,7 +145,7 @@ def split_overrides(task: str | None, overrides: Sequence[str]) -> tuple[str | N
 
 
 def named_task_or_run(task: str, runs_dir: Path | None) -> TaskSource:
-    """Return the task that the user has named. If the name is that of a run, a common mistake, the error says so.
+    """Return the task that the user has named. If a run has this name (a common mistake), the error says so.
 
     Args:
         task: name, file or folder of a task.

@@ -56,7 +56,7 @@ def error_of_task(error: BaseException) -> TaskError | None:
 
 
 def _frames_of(error: BaseException) -> list[tuple[FrameType, int]]:
-    """Return the frames of an error's traceback with their lines; if no frame is a task's, those of its cause."""
+    """Return the frames of an error's traceback with their lines; or, if none is a task's, of its cause."""
     seen: set[int] = set()
     frames: list[tuple[FrameType, int]] = []
     cause: BaseException | None = error

@@ -268,7 +268,7 @@ class FailureRecorder(StepObserver):
             self._keep_lowest(("terminated", *names), returns, rest & (code == causes), ended)
 
     def _keep_lowest(self, key: _Key, value: NDArray[np.float32], mask: NDArray[np.bool_], ended: Episodes) -> None:
-        """Keep the episode with the lowest value, unless one with a lower value is kept already under the key.
+        """Keep the episode with the lowest value under a key, if no episode with a lower value is kept there already.
 
         Args:
             key: kind of the episode, and the causes of its end.
@@ -317,7 +317,7 @@ class FailureRecorder(StepObserver):
         return first - FAR * spread, third + FAR * spread
 
     def _update_quartiles(self) -> None:
-        """Add the returns of the finished iteration to those of recent episodes, and compute the quartiles."""
+        """Add the returns of the finished iteration to the returns of recent episodes, and compute the quartiles."""
         if self._returns:
             self._recent = np.concatenate([self._recent, *self._returns])[-RECENT:]
             self._returns.clear()

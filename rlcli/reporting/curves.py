@@ -283,8 +283,8 @@ def _settings(run: Run) -> dict[str, Any]:
 def _labels(groups: Sequence[Curve]) -> list[str]:
     """Return a label for each group of runs, which distinguishes it from the other groups.
 
-    The label is the group's `--name`, or those of task, agent and settings that differ between the groups. Settings are
-    compared only between groups of the same task, an agent's settings only between groups of the same agent.
+    The label is the group's `--name`, or task, agent and settings as far as these differ between the groups. Settings
+    are compared only between groups of the same task, an agent's settings only between groups of the same agent.
     """
 
     def differ(key: str, compared: Sequence[Curve]) -> bool:

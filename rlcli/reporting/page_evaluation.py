@@ -39,7 +39,7 @@ class PageMedia:
         self._name = checkpoint.resolve().name
 
     def add_evaluation(self, *, may_evaluate: bool) -> str:
-        """Add the evaluation to the page: the one saved in the run, or else a new one; return its origin.
+        """Add an evaluation to the page: a saved one of the run if there is one, else a new one; return its origin.
 
         Returns:
             `stored` (saved in the run); `made` (evaluated now); an empty text if there is no evaluation.
@@ -63,7 +63,7 @@ class PageMedia:
         return "made"
 
     def add_video(self) -> str:
-        """Add a video to the page: the one saved in the run, or else a new one; return its origin.
+        """Add a video to the page: a saved one of the run if there is one, else a new one; return its origin.
 
         Returns:
             `stored` (saved in the run); `made` (recorded now); `older` (saved, of an older checkpoint); an empty text

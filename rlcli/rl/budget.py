@@ -1,6 +1,6 @@
 """Budget of a training: a limit of iterations, of environment steps, or both.
 
-The training loop ends when it is spent; schedules such as that of the learning rate follow it.
+The training loop ends when it is spent; schedules, such as the learning rate's, follow it.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Budget:
 def remaining_budget(config: AgentConfig, trainer: Trainer) -> float:
     """Return the fraction of an agent's budget that is left, from 1 (start of the training) to 0 (end).
 
-    Schedules, such as that of the learning rate, use the value. It is constant during an iteration.
+    Schedules, such as the learning rate's, use the value. It is constant during an iteration.
     """
     by_iterations = trainer.iteration / (config.max_iterations or math.inf)
     by_steps = trainer.iteration * trainer.steps_per_iteration / (config.max_steps or math.inf)

@@ -23,7 +23,7 @@ LEARNER_HINT = "lower learning_rate or max_grad_norm; the last good checkpoint i
 def require_finite(
     tensors: Iterable[tuple[str, Tensor]], iteration: int, axes: tuple[str, ...] = (), hint: str = LEARNER_HINT
 ) -> None:
-    """Check that all tensors are finite, and name the first one that is not, which is the cause of the others.
+    """Check that all tensors are finite; the error names the first tensor that is not, because it is the cause.
 
     Args:
         tensors: names and values, each tensor after those from which it is computed.

@@ -144,7 +144,7 @@ def _result(function: str, arguments: _Value) -> _Value:
     """Return the simulated result of a call in a pickle.
 
     Raises:
-        _RefusedError: if the call is not one that rebuilds a tensor or makes an empty OrderedDict.
+        _RefusedError: if the call does anything but rebuild a tensor or make an empty OrderedDict.
     """
     if function in _FUNCTIONS:
         return _Value()
@@ -158,7 +158,7 @@ class _RefusedError(Exception):
 
 
 def require_tensors_only(description: bytes, where: str) -> None:
-    """Check that a pickle creates only tensors and plain data, which are neither nested deeply nor slow to hash.
+    """Check that a pickle creates only tensors and plain data, without deep nesting and without keys that hash slowly.
 
     Args:
         description: the pickle, which is not executed.

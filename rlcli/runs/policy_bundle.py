@@ -159,8 +159,8 @@ def _require_same_policy(checkpoint: Checkpoint, fresh: Path, output: Path) -> N
     pairs = zip(before.state_dict().values(), after.state_dict().values(), strict=True)
     if before.spec != after.spec or not all(torch.equal(value, written) for value, written in pairs):
         raise VerdictError(
-            f"{output} is not kept: the policy read back from it differs from that of {checkpoint.folder}; export it"
-            " again, and report the bug if this repeats"
+            f"{output} is not kept: the policy read back from it differs from the policy of {checkpoint.folder};"
+            " export it again, and report the bug if this repeats"
         )
 
 

@@ -104,7 +104,7 @@ class Run:
         write_atomic(self.folder / RECORD, to_json(self.record))
 
     def lock(self) -> None:
-        """Lock the run for this process, the only one that may write to it.
+        """Lock the run, so that only this process may write to it.
 
         Raises:
             MachineError: if another process is writing to this run.
@@ -121,7 +121,7 @@ class Run:
             self._lock.release()
 
     def discard(self) -> None:
-        """Delete a run that has not started, unless another process may write to it."""
+        """Delete a run that has not started, if no other process may be writing to it."""
         with contextlib.suppress(MachineError):
             require_lock(self.folder)
             shutil.rmtree(self.folder, ignore_errors=True)

@@ -168,7 +168,7 @@ def find_checkpoint(
 
 
 def _newest_valid(run: Run, have: list[int], why: str, whole: bool) -> tuple[Path, str]:
-    """Return the newest valid checkpoint of a run, and the reason for the choice; log each newer one that is corrupt.
+    """Return the newest valid checkpoint of a run, and the reason for the choice; log newer, corrupt checkpoints.
 
     Args:
         run: the run.

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class EntityData:
-    """State of an entity in every environment, in float32. The world frame is that of the environment's own simulation.
+    """State of an entity in every environment, in float32. The world frame belongs to the environment's own simulation.
 
     Do not write to the attributes: most are live views of the state. Set the state with the methods of `Entity`.
     """

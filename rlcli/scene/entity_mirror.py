@@ -77,7 +77,7 @@ class EntityMirror:
             self.joints[joint] = other, self._sign(body, joint, other)
 
     def _sign(self, body: int, joint: int, other: int) -> int:
-        """Return the sign with which the coordinate of joint `other` follows from that of its partner, `joint`.
+        """Return the sign by which the coordinate of `joint` is multiplied to get that of its partner `other`.
 
         It is +1 for the free joint of the root.
         """

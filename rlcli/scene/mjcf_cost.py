@@ -91,7 +91,7 @@ class ModelCost:
 
 @dataclass(slots=True)
 class References:
-    """References between the elements of a model by name, such as those of sensors, actuators and tendons.
+    """References by name between the elements of a model: sensors, actuators and tendons refer to other elements.
 
     MuJoCo copies an element with each replica of an element that it refers to.
     """

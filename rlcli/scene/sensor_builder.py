@@ -163,7 +163,7 @@ class SensorBuilder:
         return CameraSensorSpec(config, prefix + config.camera)
 
     def _body(self, entity: str, pattern: str | None, path: tuple[str, ...]) -> str:
-        """Return the full name, `entity/body`, of the one body that a pattern matches; without a pattern the root's."""
+        """Return the full name, `entity/body`, of the one body that matches a pattern, or of the root for None."""
         bodies = self._bodies(entity, ".*" if pattern is None else pattern, path, "body")
         if pattern is not None and len(bodies) > 1:
             short = listing([body.removeprefix(f"{entity}/") for body in bodies])

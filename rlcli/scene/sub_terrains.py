@@ -102,7 +102,7 @@ def shifted(block: Block, offset: tuple[float, float]) -> Block:
 
 
 def ring(outer: Block, inner: Block) -> list[Block]:
-    """Return four blocks that fill the area between two rectangles; their height is that of the outer rectangle."""
+    """Return four blocks that fill the area between two rectangles; they have the height of the outer rectangle."""
     (x0, y0), (x1, y1) = outer.low, outer.high
     (left, front), (right, back) = inner.low, inner.high
     return [

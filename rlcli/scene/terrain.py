@@ -189,7 +189,7 @@ class Terrain:
         Args:
             selection: the environments.
             up: environments that move up. (rows,) bool
-            down: environments that move down, unless they move up. (rows,) bool
+            down: environments that move down, if `up` does not mark them. (rows,) bool
         """
         levels = selection.read(self.levels) + up.long() - (down & ~up).long()
         drawn = selection.stream(_MOVE).choice(self.rows)
@@ -242,7 +242,7 @@ def _choose_patch(
 
 
 def _spawn_height(heights: Heights, resolution: float) -> float:
-    """Return the height of the origin of a patch: that of the highest point near its middle [m]."""
+    """Return the height of the origin of a patch, which is the height of the highest point near its middle [m]."""
     reach = round(_SPAWN_HALF_WIDTH / resolution)
     x, y = (n // 2 for n in heights.shape)
     return float(heights[max(0, x - reach) : x + reach + 1, max(0, y - reach) : y + reach + 1].max())

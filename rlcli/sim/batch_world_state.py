@@ -132,7 +132,7 @@ class BatchWorlds:
             model.opt.disableflags = self._disable_flags
 
     def record_calls(self, calls: int, memory: int = HISTORY_MEMORY) -> None:
-        """Record the states before the last `calls` calls of `step`, or of as many calls as fit into `memory` bytes."""
+        """Record the states before the last `calls` calls of `step`; fewer calls if `memory` bytes are too little."""
         self._new_history(self.history.width, calls, memory)
 
     def recorded_calls(self, env: int) -> list[Call]:

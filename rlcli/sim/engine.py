@@ -82,7 +82,7 @@ class ReplayableView(EngineView, Protocol):
         """States before the last calls of `step`."""
 
     def record_calls(self, calls: int, memory: int = HISTORY_MEMORY) -> None:
-        """Record the states before the last `calls` calls of `step`, or of as many calls as fit into `memory` bytes."""
+        """Record the states before the last `calls` calls of `step`; fewer calls if `memory` bytes are too little."""
 
     def recorded_calls(self, env: int) -> list[Call]:
         """Return the recorded calls of `step` in a world's present episode, the oldest first."""

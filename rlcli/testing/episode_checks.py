@@ -202,9 +202,9 @@ def back_fill(subject: TaskUnderTest) -> Iterator[Finding]:
     """Check that the first observation of an episode has no values of the last episode in histories and buffers."""
     task = subject.resolved.task
     if task.scene.terrain is not None:
-        raise NotRunError("on terrain the start of an episode depends on the one before: nothing to compare")
+        raise NotRunError("on terrain the start of an episode depends on the previous one: nothing to compare")
     if task.curriculum:
-        raise NotRunError("with a curriculum an episode may depend on the one before: nothing to compare")
+        raise NotRunError("with a curriculum an episode may depend on the previous one: nothing to compare")
     pair = _EnvPair(subject, scale=-0.5)
     pair.step(5)
     for env in (pair.kept, pair.ended):

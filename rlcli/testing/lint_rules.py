@@ -62,7 +62,7 @@ def early_resets(evidence: RolloutEvidence) -> Iterator[Remark]:
 
 
 def _weighted_terms(evidence: RolloutEvidence) -> list[str]:
-    """Return the names of the reward terms with a weight other than 0."""
+    """Return the names of the reward terms with a nonzero weight."""
     rewards = evidence.subject.resolved.task.rewards
     env = evidence.rollouts[0].env
     if not isinstance(env, ManagedEnv):
@@ -72,7 +72,7 @@ def _weighted_terms(evidence: RolloutEvidence) -> list[str]:
 
 
 def silent_reward(evidence: RolloutEvidence) -> Iterator[Remark]:
-    """Check that no reward term with a weight other than 0 is 0 in every step of the fixed policies."""
+    """Check that each reward term with a nonzero weight is nonzero in at least one step of the fixed policies."""
     if evidence.steps < min(evidence.subject.resolved.task.max_episode_length, MAX_STEPS):
         return  # a term may be other than 0 only at the end of an episode, which a shorter rollout does not reach
     steps = sum(rollout.reward.numel() for rollout in evidence.rollouts)
@@ -175,7 +175,7 @@ def constant_observation(evidence: RolloutEvidence) -> Iterator[Remark]:
 
 
 def observation_scale(evidence: RolloutEvidence) -> Iterator[Remark]:
-    """Check that observations have a size near 1, unless the agent normalises them."""
+    """Check that observations have a size near 1, if the agent does not normalise them."""
     if getattr(evidence.subject.resolved.agent, "normalize_observations", False):
         return
     turning = _angles_without_limits(evidence.rollouts[0].env)

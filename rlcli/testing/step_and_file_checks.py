@@ -230,5 +230,5 @@ def aliasing(subject: TaskUnderTest) -> Iterator[Finding]:
         yield error_at(name, message, "write into a tensor of your own, or clone() first")
     for name, step in recording.shared.items():
         if name not in recording.late_writes:
-            message = f"the tensor shares its memory with that of the step before, at step {step}"
+            message = f"the tensor of step {step} shares its memory with the tensor of the step before"
             yield error_at(name, message, "return a new tensor instead of a buffer that the term reuses")

@@ -23,11 +23,11 @@ class Recording:
     steps: list[StepResult] = field(default_factory=list)
     """The step results themselves, not copies: the task may have changed their tensors in later steps."""
     obs: list[dict[str, Tensor]] = field(default_factory=list)
-    """Copies of the observations, those of the reset first: for each step, group -> (num_envs, d)."""
+    """Copies of the observations, beginning with the reset: for each step, group -> (num_envs, d)."""
     late_writes: dict[str, int] = field(default_factory=dict)
     """Name of an output that was changed in place during a later step -> index of the first such step."""
     shared: dict[str, int] = field(default_factory=dict)
-    """Name of an output whose tensor shares memory with that of the step before -> index of the first such step."""
+    """Name of an output whose tensor shares memory with the previous step's -> index of the first such step."""
     error: Exception | None = None
 
 

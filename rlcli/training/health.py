@@ -53,7 +53,7 @@ class Finding:
 
 
 class Health:
-    """Health checks of one training. They run about 40 times in a training, so that they take hardly any time.
+    """Health checks of one training. They run only about 40 times in a training, so they take almost no time.
 
     Args:
         task: the task.
@@ -204,7 +204,7 @@ def no_reward(health: Health) -> Found:
 
 
 def no_progress(health: Health) -> Found:
-    """Report that neither return, reward terms, episode length nor values of success conditions have changed."""
+    """Report that return, reward terms, episode length and values of success conditions have all stayed the same."""
     # if all episodes end by time-out, few iterations have episodes that end
     if len(health.values(RETURN)) < _MIN_VALUES:
         return

@@ -211,7 +211,7 @@ class TrainLoop:
         self._iteration_s = time.monotonic() - begin
 
     def _save(self) -> None:
-        """Save a checkpoint of the state between two iterations, unless it exists."""
+        """Save a checkpoint of the state between two iterations, if this checkpoint does not exist yet."""
         boundary = self.trainer.iteration, self.trainer.env_steps
         if self.writer.newest != boundary:
             state = self.trainer.state()  # a collective operation: every rank must call it

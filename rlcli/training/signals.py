@@ -49,7 +49,7 @@ class StopRequest(StepObserver):
 
     @contextlib.contextmanager
     def interruptible(self, interruptible: bool = True) -> Iterator[None]:
-        """Raise `Interrupted` at the first signal, anywhere in the `with` block, unless `interruptible` is False."""
+        """Raise `Interrupted` at the first signal, anywhere in the `with` block, if `interruptible` is true."""
         self._interruptible = interruptible
         try:
             self.check()

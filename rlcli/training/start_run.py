@@ -133,7 +133,7 @@ def new_run(request: TrainingRequest, resolved: Resolved, device: str) -> Job:
 
 
 def prepare_run(folder: Path, request: TrainingRequest, changes: Sequence[str] = ()) -> str:
-    """Create a run in the state `waiting` in a given folder, unless it exists; return its device.
+    """Create a run in the state `waiting` in a given folder, if it does not exist yet; return its device.
 
     Raises:
         UsageError: if the folder contains a run with other settings.
@@ -186,7 +186,7 @@ def run_record(request: TrainingRequest, resolved: Resolved, device: str) -> dic
 def resume_run(request: TrainingRequest) -> Job | TrainingResult:
     """Open and lock a run to continue it; if it is finished and has no new budget, return its result instead.
 
-    A finished run that has lost its last checkpoints is continued, unless the reference names one checkpoint.
+    A finished run that has lost its last checkpoints is continued, if the reference names the run as a whole.
     """
     from rlcli.runs.checkpoint_reader import open_checkpoint
     from rlcli.runs.restore import resolve_run

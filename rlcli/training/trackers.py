@@ -69,7 +69,7 @@ class FailSafeLogger:
         self._name, self._last_step = name, last_step
 
     def write(self, iteration: int, step: int, metrics: dict[str, float]) -> None:
-        """Record one iteration, unless the logger has failed or has recorded it before."""
+        """Record one iteration, if the logger works and has not recorded this iteration before."""
         if self._logger is None or step <= self._last_step:
             return
         try:

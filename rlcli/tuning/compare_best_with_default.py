@@ -238,7 +238,7 @@ def _train(
 
 
 def _run_folder(sweep: Path, name: str, request: TrainingRequest, changes: Sequence[str]) -> Path:
-    """Return the folder for a training: a new one, or that of a run with exactly these settings, which is resumed.
+    """Return the folder for a training: a new one, or the folder of a run with exactly these settings, to resume it.
 
     A number is appended to the name if a run with other settings has it already.
 

@@ -1,6 +1,6 @@
 """Renderer of environments without a window, for videos and for `render()` of Gymnasium environments.
 
-The camera is that of the task's section `viewer`.
+The camera is set in the task's section `viewer`.
 """
 
 import contextlib

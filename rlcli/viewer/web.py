@@ -106,7 +106,7 @@ class _ViewerThread:
         return self._thread.is_alive()
 
     def raise_error(self) -> None:
-        """Raise the error that has ended the viewer's thread, unless there is none or it is an `RlcliError`.
+        """Raise the error that has ended the viewer's thread, if there is one that is no `RlcliError`.
 
         Raises:
             DependencyError: if the viewer has raised an error.

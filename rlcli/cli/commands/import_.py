@@ -39,7 +39,7 @@ rlcli import rsl-rl model_1000.pt --task quadruped-flat
 )
 
 Task = Annotated[str, typer.Option("--task", autocompletion=tasks, metavar="TASK", help="Task of the policy.")]
-_ACTIVATION = "Activation of the hidden layers: elu, relu, tanh or silu. [default: that of the library]"
+_ACTIVATION = "Activation of the hidden layers: elu, relu, tanh or silu. [default: the library's]"
 Activation = Annotated[str | None, choice("NAME", "elu", "relu", "tanh", "silu", help=_ACTIVATION)]
 Bound = Annotated[float | None, typer.Option(help="Largest absolute action. [default: 1 (sb3), none (rsl-rl)]")]
 

@@ -28,7 +28,7 @@ OPTION_PANELS = {
 }
 """Panel -> names of its options, in the order of the help; all other options are in the panel "Options"."""
 _MAX_UNGROUPED = 8
-"""A command with at most this many options, besides those of "Output", has them all in the panel "Options"."""
+"""A command with at most this many options, not counting the panel "Output", has them all in the panel "Options"."""
 _UNBOUNDED = 10**9
 """Largest upper limit of an option that `--help` shows; a higher limit means any number."""
 METAVARS = {int: "INTEGER", float: "FLOAT", Path: "PATH"}

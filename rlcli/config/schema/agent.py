@@ -58,8 +58,8 @@ class AgentConfig(StrictModel):
     max_steps: Length | None = None
     """Number of environment steps of the training, summed over all environments; null: no limit."""
     max_minutes: Positive | None = None
-    """Number of minutes after which a training stops with a checkpoint; a resumed training has as many again; null: no
-    limit. Schedules follow `max_iterations` and `max_steps` only."""
+    """Number of minutes after which a training stops with a checkpoint; a resumed training may take as long. null:
+    no limit. Schedules follow `max_iterations` and `max_steps` only."""
     save_interval: Length | None = None
     """Iterations between two checkpoints; null: a checkpoint every 60 s and one at the end."""
     keep_last: Count | None = None

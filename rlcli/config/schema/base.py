@@ -54,7 +54,7 @@ def _nonzero(message: str) -> AfterValidator:
 
 
 def _text(number: float) -> str:
-    """Return a number as text: all digits of a whole number, unless they are more than 20."""
+    """Return a number as text: all digits of a whole number with up to 20 digits."""
     return str(number) if isinstance(number, int) and abs(number) < 10**20 else f"{number:g}"
 
 

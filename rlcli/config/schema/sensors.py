@@ -75,7 +75,7 @@ class RaySensorConfig(StrictModel):
     max_distance: Positive = 10.0
     """Range of the sensor [m]; objects beyond it are not detected."""
     sees: Literal["ground", "all"] | Annotated[list[Annotated[int, Field(ge=0, le=5)]], Field(min_length=1)] = "ground"
-    """What rays can hit. ground: the plane or the terrain; all: every geom except those of the body; or a list of
+    """What rays can hit. ground: the plane or the terrain; all: every geom that is not on the body; or a list of
     MuJoCo geom groups (0 to 5)."""
     lookup: bool = False
     """true: rays that point straight down read the ground from the terrain's table of heights. The distances are equal

@@ -100,7 +100,7 @@ class ShardedEngine:
         return self._local.expanded_fields()
 
     def record_calls(self, calls: int, memory: int = HISTORY_MEMORY) -> None:
-        """Record the states before the last `calls` calls of `step`, or of as many calls as fit into `memory` bytes."""
+        """Record the states before the last `calls` calls of `step`; fewer calls if `memory` bytes are too little."""
         width = self.num_envs * self.history.width * 8
         self._shards.call_all(_record_calls, max(1, min(calls, memory // max(1, width))))
 

@@ -80,7 +80,7 @@ class Columns:
 
     @property
     def count(self) -> int:
-        """Number of columns in shared memory, including those of every episode (return, length, ...)."""
+        """Number of columns in shared memory, including the columns that every episode has (return, length, ...)."""
         named = (self.terms, self.causes, self.metrics, self.conditions, self.condition_values)
         return _FIXED_COLUMNS + sum(len(part) for part in named) + bool(self.conditions)
 

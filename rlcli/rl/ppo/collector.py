@@ -275,7 +275,7 @@ class Collector:
             self._update_normalizer(self.critic_normalizer, self._concatenated(obs).flatten(0, -2))
 
     def _update_normalizer(self, normalizer: Normalizer, values: Tensor) -> None:
-        """Update a normaliser with this process's values and, in a group, with those of all others. (n, ...)"""
+        """Update a normaliser with the values of this process and of all other processes of the training. (n, ...)"""
         batch, processes = values.double(), self.process_group.world_size
         mean, var = batch.mean(dim=0), batch.var(dim=0, unbiased=False)
         if processes > 1:
