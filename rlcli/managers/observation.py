@@ -30,7 +30,7 @@ class _Group:
 
 
 _FINAL = np.uint64(0x46494E414C)
-"""Number that changes the random streams for final observations, so that their noise is that of no other observation.
+"""Number that changes the random streams for final observations, so that they have other noise than all others.
 
 It is combined with the index of a stream by xor.
 """
@@ -92,7 +92,7 @@ class ObservationManager(TensorState):
         return self._final
 
     def recompute_last(self) -> dict[str, Tensor]:
-        """Return the observations of the last `compute` again, after `load_state_dict`."""
+        """Return the observations of the last `compute` again; used after `load_state_dict`."""
         result, draws = {}, self._draws(np.uint64(0))
         for name, group in self.groups.items():
             if not _has_memory(group):
