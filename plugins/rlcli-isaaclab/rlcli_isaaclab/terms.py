@@ -273,8 +273,8 @@ class _Bound:
             return torch.zeros(self._env.num_envs, device=self._env.device, dtype=dtype)
         if self._section == "observations" and value.dim() == 1:
             return value.unsqueeze(1).float()  # Isaac Lab allows (num_envs,) in groups that are not concatenated
-        if self._section == "observations" and value.dim() == 3:
-            return value.flatten(1)  # as Isaac Lab does for a term with a history
+        if self._section == "observations" and value.dim() not in (2, 4):
+            return value.flatten(1 if value.dim() == 3 else 3)  # a history, as in Isaac Lab; images (n, h, w, 1, 1)
         return value.bool() if self._section == "terminations" and value.dtype != torch.bool else value
 
 
