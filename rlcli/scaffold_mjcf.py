@@ -112,9 +112,9 @@ class Robot:
             if obstacle := self.obstacle_to("velocity"):
                 return "balance", obstacle
             if driven < 4:
-                return "balance", f"its base floats and it has feet, but only {driven} driven joints; walking needs 4"
+                return "balance", f"its base floats, but it has only {driven} driven joints, and walking needs 4"
             if driven <= len(undriven):
-                return "balance", f"its base floats and it has feet, but {without}, and only {driven} do"
+                return "balance", f"its base floats, but {without}, and only {driven} have one"
             return "velocity", f"its base floats, it has {len(self.feet())} feet and {driven} driven joints"
         if undriven:
             return "balance", f"its base is fixed, but {without}"
@@ -245,7 +245,7 @@ class Robot:
         """Return the key `scene` of a task of this kind for the robot, as data for its YAML."""
         robot: dict[str, Any] = {"model": "model.xml"}
         if self.free:
-            robot["pos"] = [0.0, 0.0, round(self.height + 0.005, 4)]
+            robot["pos"] = [0.0, 0.0, round(self.height + 0.0005, 4)]  # 0.5 mm: touching, but never inside the ground
         if kind != "balance" and (settings := self.joint_settings(kind)):
             robot["joints"] = settings
         pose = {self.name(j): round(float(self.data.qpos[self.model.jnt_qposadr[j]]), 4) for j in self.joints}

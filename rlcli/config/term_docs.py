@@ -9,6 +9,7 @@ import json
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
@@ -86,13 +87,15 @@ def term_entries(pattern: str = "", term_files: Iterable[Path] = ()) -> list[Ter
     """Return the terms whose name, section or summary contains the pattern, in the order of sections and names.
 
     Args:
-        pattern: text to look for; case is ignored.
+        pattern: text to look for, or a pattern with `*`, `?` or `[...]` for the whole name; case is ignored.
         term_files: files with a task's own terms, which are listed too.
     """
     own = Vocabulary.of(tuple(term_files)).own
     entries = [_entry(section, term) for section in SECTIONS for term in builtin_terms(section).values()]
     entries += [_entry("own", term, own=True) for term in own.values()]
     text = pattern.lower()
+    if any(sign in text for sign in "*?["):
+        return [entry for entry in entries if fnmatchcase(entry.name.lower(), text)]
     return [entry for entry in entries if text in f"{entry.name} {entry.section} {entry.summary}".lower()]
 
 

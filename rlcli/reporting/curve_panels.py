@@ -17,9 +17,11 @@ GROUPS = {"rewards": REWARDS, "terminations": TERMINATIONS}
 """Name of a group of metrics for --metrics -> prefix of their names in metrics.jsonl."""
 DEFAULT = (*METRICS, *GROUPS)
 
+_EVALUATED = "Eval/success_rate"
 _TITLES = {
     "Train/mean_reward": ("Return", "reward per episode"),
     "Train/success_rate": ("Success", "share of episodes"),
+    _EVALUATED: ("Success in evaluations", "share of episodes, no exploration noise"),
     "Train/mean_episode_length": ("Episode length", "environment steps"),
 }
 _REWARD_UNIT = "mean reward per second"
@@ -86,6 +88,8 @@ def _metrics(name: str, known: Sequence[str]) -> list[str]:
     if name in GROUPS:
         return [metric for metric in known if metric.startswith(GROUPS[name])]
     metric = METRICS.get(name, name)
+    if name == "success":  # of training episodes, and of evaluations if the training had any
+        return [each for each in (metric, _EVALUATED) if each in known]
     return [metric] if metric in known else [other for other in known if other.partition("/")[0] == metric]
 
 

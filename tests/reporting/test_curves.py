@@ -219,6 +219,14 @@ def test_default_panels_of_one_curve(tmp_path):
     assert panels[4].stacked
 
 
+def test_success_of_evaluations_has_its_own_panel(tmp_path):
+    curves, _ = gather([write_run(tmp_path, rows=learning(**{"Eval/success_rate": 0.97}))])
+    titles = [panel.title for panel in choose(curves)]
+    assert titles[1:3] == ["Success", "Success in evaluations"]
+    assert [panel.title for panel in choose(curves, ["success"])] == ["Success", "Success in evaluations"]
+    assert choose(curves)[2].items[0].line.middle == pytest.approx(0.97)
+
+
 def test_panels_of_several_curves(tmp_path):
     runs = [write_run(tmp_path, rows=learning()), write_run(tmp_path, agent="sac", rows=learning())]
     panels = choose(gather(runs)[0])

@@ -118,6 +118,15 @@ def test_end_of_training_names_what_success_counts_and_a_comparison_below_the_ba
     assert (f"rlcli eval --compare {run} zero\n" in err) is compares
 
 
+def test_end_of_training_prefers_the_success_of_the_last_evaluation(start, only_run):
+    words = ["--max-iterations", 2, "agent.eval_interval=1", "agent.eval_episodes=4"]
+    end = ["episode_length_s=0.1", "success.pole.at_most=3.2", "success.pole.hold_s=0"]
+    _, err = start("train", "cartpole", *LONG, *words, *end).communicate(timeout=60)
+    says = "success 100.0% in the last evaluation, without exploration noise; repeat: rlcli eval --checkpoint"
+    assert f"{says} {only_run()}\n" in err
+    assert "with exploration noise" not in err
+
+
 def test_quiet_prints_only_the_result(start, only_run):
     out, err = start("train", "cartpole", *LONG, "-q", "--max-iterations", 2).communicate(timeout=60)
     assert (out, err) == (f"{only_run()}\n", "")

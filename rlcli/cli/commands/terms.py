@@ -26,7 +26,8 @@ def command(
     key, with its unit, and an example.
 
     Options:
-        pattern: Text in the name, section or summary of the terms. [default: all terms]
+        pattern: Text in the name, section or summary of the terms, or a pattern of names such as `root_*`.
+            [default: all terms]
         task: Add the terms of this task.
 
     Examples:

@@ -223,13 +223,17 @@ def _print(result: TrainingResult) -> None:
 
 def _next_steps(result: TrainingResult) -> list[str]:
     """Return messages that explain the last success rate or return, and name commands that judge the policy."""
-    success, mean_return = (result.metrics.get(f"Train/{name}") for name in ("success_rate", "mean_reward"))
+    kind = "Eval" if "Eval/mean_reward" in result.metrics else "Train"  # Eval: the last iteration was evaluated
+    success, mean_return = (result.metrics.get(f"{kind}/{name}") for name in ("success_rate", "mean_reward"))
     if mean_return is None:
         return []
     figure = f"return {mean_return:.4g}" if success is None else f"success {success:.1%}"
     run = shlex.quote(str(result.run))
-    counts = "counts the last episodes of the training, with exploration noise"
-    lines = [f"{figure} {counts}; without noise: rlcli eval --checkpoint {run}"]
+    if kind == "Eval":
+        lines = [f"{figure} in the last evaluation, without exploration noise; repeat: rlcli eval --checkpoint {run}"]
+    else:
+        counts = "counts the last episodes of the training, with exploration noise"
+        lines = [f"{figure} {counts}; without noise: rlcli eval --checkpoint {run}"]
     if success is None or success < _GOOD:
         lines.append(f"compare it with a policy of zero actions: rlcli eval --compare {run} zero")
     return lines

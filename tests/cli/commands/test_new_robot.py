@@ -63,7 +63,7 @@ def test_floating_base_tracks_velocities(cli, tmp_path):
     assert result.json["flavour"] == "velocity"
     assert "5 joints: root, (unnamed)" in result.err
     robot = task["scene"]["entities"]["robot"]
-    assert robot["pos"][2] == pytest.approx(0.225, abs=0.001)  # the legs just touch the ground
+    assert robot["pos"][2] == pytest.approx(0.2205, abs=0.0002)  # the legs just touch the ground
     assert len(robot["joints"]) == 4  # the file has no actuators
     assert len(task["scene"]["sensors"]["feet"]["bodies"]) == 4
     assert task["scene"]["sensors"]["trunk"]["bodies"] == ["trunk"]
@@ -240,7 +240,7 @@ def test_loose_object_and_terrain_do_not_lift_the_robot(cli, tmp_path):
     text = DOG.replace("</worldbody>", ball).replace("<light", field)
     text = text.replace("<worldbody>", '<asset><hfield name="h" nrow="3" ncol="3" size="9 9 2 1"/></asset><worldbody>')
     _, task = written(cli, tmp_path, text)
-    assert task["scene"]["entities"]["robot"]["pos"][2] == pytest.approx(0.225, abs=0.001)
+    assert task["scene"]["entities"]["robot"]["pos"][2] == pytest.approx(0.2205, abs=0.0002)
 
 
 def test_root_whose_z_axis_is_not_up_gets_a_level_parent(cli, tmp_path):

@@ -31,6 +31,12 @@ def test_terms_of_task_include_own_terms(cli, tmp_path):
     assert "own:\n  calmness(speed: number = 2.0)" in cli("terms", "calm", "--task", str(folder)).out
 
 
+def test_terms_with_a_star_must_match_the_whole_name(cli):
+    names = [term["name"] for term in cli("terms", "root_lin_*_W", "--json").json["terms"]]
+    assert names == ["root_lin_vel_w"]
+    assert cli("terms", "lin_*_w", "--json").json["terms"] == []
+
+
 def test_terms_json_has_every_key(cli):
     (term,) = cli("terms", "joint_vel_l1", "--json").json["terms"]
     assert [key["name"] for key in term["keys"]] == ["entity", "joints"]
