@@ -1,4 +1,6 @@
-"""Interface for plugins that read the task files of other frameworks: what a plugin declares, and what it returns.
+"""Interface for plugins that read the task files of other frameworks.
+
+A plugin declares a `FormatSpec`; its functions return a `Translation` or an `Imported`, with a `Note` for each key.
 
 Types of other modules: [`TaskSource`](registry.md#tasksource) has the name, the folder and the files of a task;
 `Document` (`rlcli.config.strict_yaml`) is a parsed YAML file, with the line and column of each key; `Origin`
@@ -21,8 +23,8 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 Status = Literal["mapped", "approximated", "ignored", "task", "default", "to do"]
-"""mapped, approximated, ignored: translated exactly, translated with a difference, not translated; task: read by the
-task's own class; default: the key has its default value; to do: the user must translate it."""
+"""How a key was translated. mapped: exactly; approximated: with a difference; ignored: not at all; task: the task's own
+class reads the key; default: the key has its default value; to do: the user must translate the key."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +98,7 @@ class Translation:
     notes: list[Note]
     """How each key was translated."""
     agents: dict[str, Any] = field(default_factory=dict)
-    """Agents that were read from a separate file: name -> settings."""
+    """Agents that `read` found in a separate file: name -> settings."""
     agents_origin: Callable[[tuple[str | int, ...]], Origin] | None = None
     """Function like `origin` for the paths in `agents`; None: no agents were read from a file."""
 

@@ -13,7 +13,7 @@ T = TypeVar("T")
 
 @dataclass(slots=True)
 class Work:
-    """Progress of one operation, such as an evaluation: what is counted, how many there are, and how many are done."""
+    """Progress of one operation, such as an evaluation: its name, the number of its parts, and how many are done."""
 
     what: str
     """Name of the operation, or of the things that are counted, such as `episodes`."""
@@ -22,8 +22,9 @@ class Work:
     done: int = 0
     """Number of parts that are done."""
     share: float = 0.0
-    """Second estimate of the done share, from 0 to 1; the view shows the larger estimate. Operations whose parts run
-    at the same time set it, such as episodes in parallel environments: `done` stays 0 until the first of them ends."""
+    """Share of the work that is done, from 0 to 1, as the operation estimates it; `fraction` returns the larger one of
+    this value and `done` / `total`. Operations set it if their parts run at the same time, such as episodes in parallel
+    environments: `done` stays 0 until the first part ends."""
     has_own_view: bool = False
     """Whether the operation shows its own progress, so that no second progress bar may be drawn."""
     begin: float = field(default_factory=time.monotonic)
@@ -38,7 +39,7 @@ class Work:
         self.update(self.done + count, self.share)
 
     def update(self, done: int, share: float) -> None:
-        """Set the number of parts that are done, and the second estimate of the done share."""
+        """Set the number of parts that are done, and the operation's own estimate of the share (`share`)."""
         self.done, self.share, self.changed = done, share, time.monotonic()
 
     def fraction(self) -> float:

@@ -18,9 +18,11 @@ _NO_MEMORY = re.compile(
     r"|out of memory",
     re.IGNORECASE,
 )
-"""Messages about too little memory of MuJoCo, torch, the dynamic linker and Python; their classes differ."""
+"""Texts of the errors of MuJoCo, torch, the dynamic linker and Python that mean too little memory; their classes
+differ."""
 _UNDER_A_LIMIT = re.compile(r"failed to load the shared library|framebuffer is not complete", re.IGNORECASE)
-"""Messages of Warp and OpenGL that can have other causes; with a limit on the memory they mean too little memory."""
+"""Texts of errors of Warp and OpenGL that can have several causes. If the process has a memory limit, they mean too
+little memory."""
 
 
 def memory_limit(groups: Path = GROUPS, own: Path = OWN_GROUP) -> int | None:

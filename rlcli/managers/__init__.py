@@ -1,1 +1,1 @@
-"""Managers of manager-based tasks. Each calls the terms of one section of the task's YAML file."""
+"""Managers of manager-based tasks. Each calls the terms (functions and classes) of one section of the YAML."""

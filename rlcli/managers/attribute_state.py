@@ -35,7 +35,8 @@ class AttributeState:
     """Saver of an object's attributes, and of those of its helpers: attributes that are objects of the task's classes.
 
     Args:
-        owner: the object, before the first step: later values that differ count as changed.
+        owner: the object. Make the saver before the first step: values that differ later from those of now have
+            changed.
         excluded: names of attributes that are not saved.
     """
 

@@ -27,16 +27,20 @@ _COLUMNS = {"start": 3, "end": 3, "center": 3, "position": 3, "quat": 4}
 class CommandTerm(Protocol):
     """Interface of a command term: a class `Name(env, *, ...)` whose keyword arguments are the term's keys in the YAML.
 
-    Optional members: `metrics() -> dict[str, Tensor]`, errors of following the command, (num_envs,) each, whose means
-    over an episode are logged. `reset(selection)`, `state_dict` and `load_state_dict` for further state. `elements`,
-    names of the columns of `command` that a person may set ("" for other columns). `limits`, their usual [low, high].
-    `units`, their units. `mirror_signs`, +1 or -1 for each column: the command times its signs is the command of the
-    mirror image about the x-z plane of the robot; the agent's key `symmetry` needs it.
+    Optional members:
+
+    - `metrics() -> dict[str, Tensor]` returns how far the robot is from the command, (num_envs,) each. The means over
+      an episode are logged.
+    - `reset(selection)`, `state_dict()` and `load_state_dict(state)` are for further state of the term.
+    - `elements` has the names of the columns of `command` that a user may set ("" for other columns), `limits` their
+      usual [low, high], and `units` their units.
+    - `mirror_signs` has +1 or -1 for each column: the command times these signs is the command of the robot's mirror
+      image about its x-z plane. The agent's key `symmetry` needs it.
 
     `markers() -> list[Marker]` returns the command as arrows, spheres and frames (`rlcli.sim.markers`): positions in
     the world frame (num_envs, 3) [m], like `entity.data.root_pos_w`, and quaternions (w, x, y, z), (num_envs, 4). It is
-    called once for each image, never in a step, and must change nothing. It may read the state of roots and joints,
-    and the fields that `metrics` or `update` read: a first read of another field makes the engine compute that field in
+    called once for each image, never in a step, and must change nothing. It may read the state of roots and joints, and
+    the fields that `metrics` or `update` read: a first read of another field makes the engine compute that field in
     each step.
     """
 
@@ -47,7 +51,7 @@ class CommandTerm(Protocol):
         """Draw new commands for the selected environments."""
 
     def update(self) -> None:
-        """Update the command from the state, as a yaw rate from a heading; called once a step, after resampling."""
+        """Update what depends on the state, such as a yaw rate from a heading; called each step, after `resample`."""
 
 
 @dataclass(frozen=True, slots=True)

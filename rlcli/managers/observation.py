@@ -30,7 +30,7 @@ class _Group:
 
 
 _FINAL = np.uint64(0x46494E414C)
-"""Number that changes the random streams for final observations, so that their noise is that of no other observation.
+"""Number that changes the random streams for final observations, so that they have other noise than all others.
 
 It is combined with the index of a stream by xor.
 """
@@ -57,6 +57,8 @@ class ObservationManager(TensorState):
         self._final = {name: torch.zeros_like(group.buffers[0]) for name, group in self.groups.items()}
         self._final_views = {name: _split(self._final[name], group.pipelines) for name, group in self.groups.items()}
         self._fresh: Selection | None = None
+        self.repeats_calls = False
+        """Whether terms are called once more for a step: a term with a state must not advance then."""
         self._term_resets = [
             reset for group in self.groups.values() for pipeline in group.pipelines for reset in pipeline.resets
         ]
@@ -82,6 +84,7 @@ class ObservationManager(TensorState):
                 None: all environments.
         """
         draws = self._draws(_FINAL)
+        self.repeats_calls = True
         for name, group in self.groups.items():
             for pipeline, view in zip(group.pipelines, self._final_views[name], strict=True):
                 if rows is None or pipeline.has_memory or pipeline.is_plain:
@@ -89,15 +92,18 @@ class ObservationManager(TensorState):
                 else:
                     pipeline.write_rows(view, rows, _FINAL)
             self._require_finite(name, group, self._final[name])
+        self.repeats_calls = False
         return self._final
 
     def recompute_last(self) -> dict[str, Tensor]:
-        """Return the observations of the last `compute` again, after `load_state_dict`."""
+        """Return the observations of the last `compute` again; used after `load_state_dict`."""
         result, draws = {}, self._draws(np.uint64(0))
+        self.repeats_calls = True
         for name, group in self.groups.items():
             if not _has_memory(group):
                 self._fill(group, group.views[group.next], draws, advance=True)
             result[name] = group.buffers[group.next]
+        self.repeats_calls = False
         return result
 
     def reset(self, selection: Selection) -> None:

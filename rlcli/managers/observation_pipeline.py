@@ -24,7 +24,7 @@ Sampler = Callable[[Selection], Tensor]
 """Function that draws random values for a selection, one row for each of its environments."""
 
 _BIAS, _LAG, _REDRAW, _REDRAWN = (np.uint64(0x4F42_5330 + i) for i in range(4))
-"""Numbers that make further random streams of a term, for its bias and its delay: stream xor number."""
+"""Numbers from which a term gets separate random streams for its bias and its delay: stream xor number."""
 
 _FEW_COLUMNS = 64
 """Largest number of columns for which copying the rows of 512 environments is faster than selecting a few rows."""
@@ -94,7 +94,7 @@ class Pipeline:
 
     @property
     def is_plain(self) -> bool:
-        """Whether the observation is a copy of few columns, which is faster for all environments than for some."""
+        """Whether the observation only copies a few columns: that is faster for all environments than for some."""
         return not self._stages and self.size <= _FEW_COLUMNS
 
     @property

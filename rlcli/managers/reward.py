@@ -1,4 +1,4 @@
-"""Rewards: the sum of weight x value x step_dt over the terms, with sums over the episode for each term."""
+"""Manager of the reward terms. The reward of a step is the sum of weight x value x step_dt over the terms."""
 
 from __future__ import annotations
 
@@ -58,8 +58,8 @@ class RewardManager(TensorState):
     def compute(self, diverged: Tensor | None = None, terminated: Tensor | None = None) -> Tensor:
         """Return the reward of this step, without adding it to the sums of the episodes. (num_envs,)
 
-        On a CPU terms are added one after the other, so that the result does not depend on the number of environments:
-        the rounding of torch's sum over rows does. On a GPU results are not bit-identical anyway.
+        On a CPU terms are added one after the other, because the rounding of torch's sum over rows depends on the
+        number of environments. On a GPU results are not bit-identical anyway.
 
         Args:
             diverged: where the simulation diverged, (num_envs,) bool; None: nowhere. On a CPU a term that is not finite

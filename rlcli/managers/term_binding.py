@@ -28,7 +28,7 @@ from rlcli.sim.engine import Engine
 from rlcli.sim.env_selection import Selection
 
 SENSORS = {"ContactSensor": "contact", "RaySensor": "rays", "CameraSensor": "camera"}
-"""Type alias of `rlcli.task` -> kind of its sensors in `scene.sensors`."""
+"""Type of a term's parameter (an alias in `rlcli.task`) -> kind of the sensors in `scene.sensors` that it accepts."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,7 @@
 """Event terms. Each changes the environments of a `Selection`, which also draws random numbers for them.
 
-These numbers depend only on the seed, the term, the environment, and its episode (interval events: the training step).
+The random numbers depend only on the seed, the term, the environment and the number of its episode. Those of interval
+events depend on the training step instead of the episode.
 """
 
 from __future__ import annotations
@@ -80,7 +81,7 @@ def reset_joints_by_gaussian(
 class ResetJointsWithinLimits(JointTerm):
     """Reset of joints to uniform positions between their soft limits, and to uniform velocities [m/s or rad/s].
 
-    position: range between the limits; 0 is the lower limit, 1 the upper.
+    position: range of the position as a fraction of the way from the lower limit (0) to the upper one (1).
     """
 
     position: Range = (0.0, 1.0)
@@ -117,9 +118,9 @@ def reset_root_state_uniform(
 ) -> None:
     """Reset the root to its default state plus uniform offsets.
 
-    x, y, z [m], linear_velocity [m/s] and angular_velocity [rad/s] are ranges in the world frame, the velocities one
-    for each axis. roll, pitch, yaw [rad] are ranges of a rotation in the root's default frame. The position is relative
-    to the environment's origin.
+    x, y, z [m] are ranges in the world frame; linear_velocity [m/s] and angular_velocity [rad/s] have one range for
+    each of its axes. roll, pitch, yaw [rad] are ranges of a rotation in the root's default frame. The position is
+    relative to the environment's origin.
     """
     default = selection.read(entity.data.default_root_state)
     offset = selection.uniform(*_bounds(env, x, y, z), (3, 1)).squeeze(2)
@@ -143,8 +144,8 @@ def reset_root_state_with_random_orientation(
 ) -> None:
     """Reset the root to a uniformly random orientation, with uniform offsets of position and velocity, world frame.
 
-    The position is relative to the environment's origin. x, y, z [m], linear_velocity [m/s] and angular_velocity
-    [rad/s] are ranges, the velocities one for each axis.
+    The position is relative to the environment's origin. x, y, z [m] are ranges; linear_velocity [m/s] and
+    angular_velocity [rad/s] have one range for each axis.
     """
     default = selection.read(entity.data.default_root_state)
     offset = selection.uniform(*_bounds(env, x, y, z), (3, 1)).squeeze(2)

@@ -98,8 +98,8 @@ class Draw:
 class DrawingTerm(Term):
     """Base class of terms that draw values relative to the original ones, with the settings that `Draw` reads.
 
-    A subclass that declares one of these settings as a field has it as a key in the YAML; otherwise the value below
-    holds.
+    A subclass that declares one of these settings as a field has it as a key in the YAML; otherwise the class attribute
+    below applies.
     """
 
     entity: Entity

@@ -18,7 +18,7 @@ from rlcli.task import ContactSensor, Entity, Sites
 
 
 def constant(values: Sequence[float] | Tensor, device: torch.device) -> Tensor:
-    """Return numbers of the configuration as a tensor, made once, because a captured CUDA graph cannot make tensors."""
+    """Return numbers of the configuration as a tensor. It is made once: a captured CUDA graph cannot make tensors."""
     return values if isinstance(values, Tensor) else _constant(tuple(values), device)
 
 
@@ -162,7 +162,7 @@ def angle_to_goal(entity: Entity, bodies: Columns, command: Command) -> Tensor:
 
 
 def _once(entity: Entity, command: Command, key: tuple[object, ...], compute: Callable[[], Tensor]) -> Tensor:
-    """Return `compute()`, computed once in a step for all terms that need the same quantity; do not write to it.
+    """Return `compute()`, called once per step for all terms that need the quantity; do not write to the result.
 
     Args:
         entity: the entity of the quantity.

@@ -291,7 +291,8 @@ def import_package(name: str, inner: str, file: Path) -> None:
     spec = importlib.util.find_spec(name)
     installed = [Path(place) for place in (spec.submodule_search_locations or ())] if spec is not None else []
     usable = [place for place in found if spec is None or place in installed]
-    usable = usable[:1] or [place for place in installed if _is_for_a_framework(place)]
+    libraries = {library for form in aliasing_formats() for library in form.spec.libraries}
+    usable = usable[:1] or [place for place in installed if name not in libraries and _is_for_a_framework(place)]
     if not usable:
         return
     folder = usable[0]

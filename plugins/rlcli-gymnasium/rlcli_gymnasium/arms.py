@@ -15,8 +15,8 @@ from rlcli.sim.rotations import length
 from .base import GymnasiumTask
 
 _CANDIDATES = 32
-"""Number of sampled positions of the puck; the first one outside of the excluded circle is used. The circle has 38 % of
-the area, so all are inside of it once in 10^13 episodes."""
+"""Number of sampled positions of the puck. The first one outside of the excluded circle around the goal is used. The
+circle has 38 % of the area, so all samples are inside of it once in 10^13 episodes."""
 
 
 class _Arm(GymnasiumTask):

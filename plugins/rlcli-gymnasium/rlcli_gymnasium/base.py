@@ -19,7 +19,7 @@ from rlcli.sim.env_selection import Selection
 
 
 class GymnasiumTask(DirectTask):
-    """One of Gymnasium's MuJoCo tasks.
+    """Base class of Gymnasium's MuJoCo tasks, as a direct task of rlcli.
 
     `observation` (num_envs, k) and `reward` (num_envs,) are the values of the buffers before the cast to float32.
     `ended` (num_envs,) is true where the task terminates the episode; it is computed before the reward, which may
@@ -30,7 +30,7 @@ class GymnasiumTask(DirectTask):
     reads: ClassVar[tuple[str, ...]] = ()
     """Derived fields of the engine that the task reads."""
     moves: ClassVar[bool] = False
-    """Whether the reward uses `speed`."""
+    """Whether the reward uses `speed`; the base class then stores `progress` before each step."""
 
     def set_up_scene(self, scene) -> None:
         """Replace the PGS solver by Newton on MuJoCo Warp, which has no PGS."""

@@ -39,6 +39,7 @@ _REASONS = {
     "pxr": ("it belongs to Isaac Sim's USD stage", "change the model (MJCF) instead"),
     "carb": ("it belongs to Isaac Sim", "remove its use"),
     "isaacsim": ("it belongs to Isaac Sim", "remove its use"),
+    "subclass of mdp.": ("rlcli's own terms are not classes", "use the term itself, or derive from ManagerTermBase"),
     "marl": ("rlcli has no multi-agent tasks", "write a task with one agent"),
 }
 """Part of a name -> the reason why rlcli does not have it, and what to do."""

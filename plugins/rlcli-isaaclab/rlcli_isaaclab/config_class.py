@@ -18,7 +18,12 @@ T = TypeVar("T")
 def configclass(cls: type[T]) -> type[T]:
     """Turn a class into a dataclass: all names except methods and nested classes become fields."""
     own = inspect.get_annotations(cls)
-    assigned = [name for name, value in vars(cls).items() if name in own or _is_setting(cls, name, value)]
+    inherited = {name for base in cls.__mro__[1:] for name in getattr(base, "__dataclass_fields__", ())}
+    assigned = [
+        name
+        for name, value in vars(cls).items()
+        if name in own or _is_setting(cls, name, value) or (name in inherited and inspect.isfunction(value))
+    ]
     if hasattr(cls, "__settings__"):  # a subclass of a class that takes any settings (sim.py)
         cls._fixed = {**cls._fixed, **{name: vars(cls)[name] for name in assigned}}  # type: ignore[attr-defined]
         return cls

@@ -6,7 +6,6 @@ import copy
 import functools
 import inspect
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +22,7 @@ from rlcli_isaaclab.observation_noise import noise_model
 from rlcli_isaaclab.own_fields import set_own_fields
 from rlcli_isaaclab.substeps import Substeps
 from rlcli_isaaclab.user_files import placed
+from rlcli_isaaclab.utils.buffers import call_without_effects
 
 
 class HookTerm:
@@ -130,7 +130,7 @@ class DirectRunner:
             manager = self.managed.termination_manager
             is_last = self.phase == "done" and bool((manager.terminated | manager.time_outs).any())
             if is_last or self.phase == "restored":
-                self._observed = self._without_effects(self._call_observations)
+                self._observed = call_without_effects([self.lab], self._call_observations)
             else:
                 self._observed = self._call_observations()
                 self.phase = "observed"
@@ -142,19 +142,6 @@ class DirectRunner:
             found["critic"] = self.lab._get_states()
         found["policy"] = self.observation_noise(found["policy"])
         return {name: _in_layout(value).float().clone() for name, value in found.items() if isinstance(value, Tensor)}
-
-    def _without_effects(self, function: Callable[[], dict[str, Tensor]]) -> dict[str, Tensor]:
-        attributes = dict(vars(self.lab))
-        tensors = [(value, value.clone()) for value in attributes.values() if isinstance(value, Tensor)]
-        generator = torch.get_rng_state()
-        found = function()
-        vars(self.lab).clear()
-        vars(self.lab).update(attributes)
-        for value, before in tensors:
-            if not torch.equal(value, before):
-                value.copy_(before)
-        torch.set_rng_state(generator)
-        return found
 
 
 def _layout_of(shape: tuple[int, ...]) -> tuple[int, ...]:

@@ -16,6 +16,7 @@ _RUNNER = b"RslRlOnPolicyRunnerCfg"
 LIBRARIES = {
     **{name: name for name in ("torchvision", "prettytable", "einops", "transformers", "numba", "warp", "psutil")},
     **{name: name for name in ("scipy", "matplotlib", "pandas", "h5py", "tqdm", "imageio", "networkx", "shapely")},
+    **{"hydra": "hydra-core", "omegaconf": "omegaconf", "wandb": "wandb", "tensorboard": "tensorboard"},
     **{"hid": "hidapi", "sklearn": "scikit-learn", "cv2": "opencv-python", "PIL": "pillow", "warp": "warp-lang"},
 }
 """Library that is installed with Isaac Lab -> its name for pip. If a library is missing, its use raises an error."""

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from rlcli.config.term_signatures import SECTIONS, Parameter, builtin_terms
 from rlcli.errors import did_you_mean
-from rlcli_isaaclab.absent import absent_value
+from rlcli_isaaclab.absent import absent_class, absent_value
 from rlcli_isaaclab.config_class import MISSING, config_subclass, configclass
 from rlcli_isaaclab.curricula import modify_env_param, modify_term_cfg
 from rlcli_isaaclab.lab_terms import LAB_TERMS
@@ -32,6 +32,10 @@ class MdpFunction:
 
     def __deepcopy__(self, memo: Any) -> MdpFunction:
         return self
+
+    def __mro_entries__(self, bases: tuple[Any, ...]) -> tuple[type, ...]:
+        """Return the base of a class that derives from the term: such a class raises an error when it is used."""
+        return (absent_class(f"a subclass of mdp.{self.__name__}"),)
 
     def __repr__(self) -> str:
         return f"mdp.{self.__name__}"

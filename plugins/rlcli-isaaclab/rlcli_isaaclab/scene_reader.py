@@ -14,7 +14,7 @@ from rlcli_isaaclab.collection import entity_name
 from rlcli_isaaclab.light_reader import read_light
 from rlcli_isaaclab.model_lookup import given_models, is_end_of, mjcf_of, model_hint
 from rlcli_isaaclab.sensor_reader import camera_kinds, filter_name, image_name, read_filters, read_sensor
-from rlcli_isaaclab.settings import Key, Node, Report, as_float, kind_of
+from rlcli_isaaclab.settings import Key, Node, Report, as_float, base_kind, kind_of
 from rlcli_isaaclab.terrain_reader import read_friction, read_ground, read_terrain
 
 
@@ -58,8 +58,9 @@ class SceneReader:
         ground: Any = None
         lights: dict[str, Any] = {}
         sensors: list[tuple[str, Node]] = []
+        own: list[tuple[str, Node]] = []
         for name, item in node.nodes():
-            kind = kind_of(item.data.get("class_type"))
+            kind, is_own = base_kind(item.data)
             spawn = item.node("spawn") if "spawn" in item else None
             spawn_function = kind_of(spawn.data.get("func")) if spawn else ""
             if kind in ("Articulation", "RigidObject", "Multirotor"):
@@ -83,6 +84,7 @@ class SceneReader:
                 self._read_entity(name, item, spawn)
             else:
                 self.report.entries[item.key] = ("ignored", "MuJoCo has no counterpart of this asset")
+            own += [(kind, item)] * is_own
         # Sensors come last: their prim paths refer to entities that may be listed after them.
         for kind, item in sensors:
             sensor = read_sensor(kind, item, self.prims, self.frames)
@@ -94,6 +96,8 @@ class SceneReader:
             if kind == "ContactSensor" and sensor is not None:
                 for index, filtered in enumerate(read_filters(item, sensor, self.prims)):
                     self.sensors[filter_name(item.key[-1], index)] = filtered
+        for kind, item in own:
+            item.note("approximated", "class_type", f"read as a {kind}; the methods of the task's class do not run")
         config["ground"] = ground
         config["lights"] = lights
         if not self.entities and not self.report.problems:

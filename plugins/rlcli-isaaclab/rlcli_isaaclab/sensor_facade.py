@@ -272,6 +272,12 @@ class Sensor:
         return self._sensor.hits.contiguous()
 
     @property
+    def quat_w(self) -> Tensor:
+        """Orientation of the body with the rays, world frame. (num_envs, 4)"""
+        quat: Tensor = self._sensor._pose()[1]
+        return quat
+
+    @property
     def num_rays(self) -> int:
         """Number of rays."""
         return len(self._sensor._starts)

@@ -28,6 +28,8 @@ def read_sensor(kind: str, item: Node, prims: Mapping[str, str], frames: dict[st
     entity = next((name for name, last in prims.items() if last in parts), None)
     if kind in ("Camera", "TiledCamera"):
         return read_camera(item, entity, parts[parts.index(prims[entity]) + 1 : -1] if entity else [])
+    if kind in ("RayCasterCamera", "MultiMeshRayCasterCamera"):
+        return read_camera(_as_camera(item), entity, parts[parts.index(prims[entity]) + 1 :] if entity else [])
     if entity is None:
         hint = f"prims of robots and objects: {listing(prims.values())}"
         item.report.problem((*item.key, "prim_path"), f"'{prim}' is not a prim of a robot or object", hint)
@@ -47,6 +49,17 @@ def read_sensor(kind: str, item: Node, prims: Mapping[str, str], frames: dict[st
         return None
     item.report.entries[item.key] = ("ignored", "read the MJCF's own sensors with the term `sensor_data`")
     return None
+
+
+def _as_camera(item: Node) -> Node:
+    """Return the settings of a camera of rays in the form of those of a camera."""
+    why = "a rendered image, which shows the whole scene, and not only the meshes of the sensor"
+    item.note("approximated", "mesh_prim_paths", why)
+    item.skip("pattern_cfg", "max_distance", "ray_alignment", "attach_yaw_only")
+    pattern, far = dict(item.data["pattern_cfg"]), item.data.get("max_distance", 1e6)
+    size = {key: pattern.pop(key) for key in ("width", "height")}
+    spawn = {**pattern, "clipping_range": (0.01, far)}
+    return Node({**item.data, **size, "spawn": spawn}, item.key, item.report)
 
 
 def _read_frames(item: Node, entity: str, body: str | None, prims: Mapping[str, str]) -> dict[str, Any]:
@@ -107,7 +120,7 @@ def read_camera(item: Node, entity: str | None, inside: list[str]) -> dict[str, 
     eye = [as_float(v) for v in offset.get("pos", (0.0, 0.0, 0.0))]
     rot = [as_float(v) for v in offset.get("rot", (1.0, 0.0, 0.0, 0.0))]
     forward, up = (_rotated(rot, axis) for axis in _FORWARD.get(convention, _FORWARD["ros"]))
-    if up[2] < 0.5 * (1.0 - forward[2] ** 2) ** 0.5 - 1e-3:
+    if up[2] < 0.5 * max(0.0, 1.0 - forward[2] ** 2) ** 0.5 - 1e-3:
         offset.note("approximated", "rot", "the camera's roll is dropped: the image's upper edge is horizontal")
     width, height = item.require("width"), item.require("height")
     aperture = spawn.get("vertical_aperture") or spawn.get("horizontal_aperture", 20.955) * height / width

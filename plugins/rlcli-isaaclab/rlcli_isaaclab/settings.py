@@ -152,6 +152,24 @@ def kind_of(value: Any) -> str:
     return name.rpartition(":")[2].rpartition(".")[2] or name.rpartition(":")[2]
 
 
+def base_kind(settings: Mapping[str, Any]) -> tuple[str, bool]:
+    """Return the name of Isaac Lab's class of an asset or sensor, and whether the task's own class derives from it."""
+    class_type = settings.get("class_type")
+    for base in class_type.__mro__ if isinstance(class_type, type) else ():
+        if base.__module__.startswith("rlcli_isaaclab"):
+            key, kind, other = _FACADES.get(base.__name__, ("class_type", base.__name__, ""))
+            return kind if key in settings else other, base is not class_type
+    return kind_of(class_type), False
+
+
+_FACADES = {
+    "Asset": ("actuators", "Articulation", "RigidObject"),
+    "CameraView": ("data_types", "Camera", "Camera"),
+    "Sensor": ("pattern_cfg", "RayCaster", "ContactSensor"),
+}
+"""Class that stands for two of Isaac Lab's -> (a setting, Isaac Lab's class with the setting, the one without it)."""
+
+
 def to_plain(value: Any) -> Any:
     """Return a setting as a YAML task can hold it: tuples become lists, and infinities become +-1e9."""
     if isinstance(value, Mapping):

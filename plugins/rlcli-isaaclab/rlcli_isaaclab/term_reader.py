@@ -18,6 +18,7 @@ from rlcli_isaaclab.managers import CommandTerm
 from rlcli_isaaclab.mdp import MdpFunction
 from rlcli_isaaclab.object_reader import OBJECT_KEYS, ObjectReader
 from rlcli_isaaclab.observation_reader import read_processing
+from rlcli_isaaclab.own_processing import ProcessedTerm, take_own_processing
 from rlcli_isaaclab.randomization import EVENTS, translate_event
 from rlcli_isaaclab.scene_reader import SceneReader
 from rlcli_isaaclab.sensor_reader import choose_image
@@ -125,7 +126,10 @@ class TermReader(ObjectReader):
         noisy = any("noise" in item for _, item in node.nodes())
         corrupt = node.get("enable_corruption", False)
         for name, item in node.nodes():
+            own = take_own_processing(item)
             config[name] = self.read_term("observations", item)
+            if any(own):
+                config[name]["func"] = ProcessedTerm(config[name]["func"], item.key, *own, self.context)
         if noisy and not corrupt:
             config["enable_corruption"] = False
         history = node.get("history_length")

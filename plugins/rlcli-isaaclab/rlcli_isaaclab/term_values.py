@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import typing
 from collections.abc import Mapping
 from typing import Any, get_args
 
@@ -80,3 +81,13 @@ def triple(ranges: Node, name: str) -> list[float]:
 def has_no_effect(key: str, value: Any) -> bool:
     """Return whether a setting that rlcli lacks has a value without effect, such as `scale` = 1."""
     return {"scale": 1.0, "offset": 0.0}.get(key) == value or value is False or value == "" or key == "use_zero_offset"
+
+
+def type_hints(call: Any) -> dict[str, Any]:
+    """Return the annotations of a function's parameters, as far as they are known when it runs."""
+    try:
+        return typing.get_type_hints(call)
+    except Exception:  # an annotation refers to a name imported under TYPE_CHECKING
+        known_types = {"float": float, "int": int, "bool": bool, "str": str, "SceneEntityCfg": SceneEntityCfg}
+        annotations: Mapping[str, Any] = getattr(call, "__annotations__", {})
+        return {name: known_types.get(a) if isinstance(a, str) else a for name, a in annotations.items()}

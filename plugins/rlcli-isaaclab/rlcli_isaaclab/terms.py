@@ -6,7 +6,6 @@ import copy
 import functools
 import inspect
 import re
-import typing
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,9 +22,10 @@ from rlcli.sim.env_selection import Selection
 from rlcli_isaaclab.config_class import is_missing, to_dict
 from rlcli_isaaclab.direct_env import building
 from rlcli_isaaclab.managers import ManagerTermBaseCfg, SceneEntityCfg
+from rlcli_isaaclab.own_processing import call_once_per_step
 from rlcli_isaaclab.settings import to_plain
 from rlcli_isaaclab.substeps import Substeps
-from rlcli_isaaclab.term_values import resolved
+from rlcli_isaaclab.term_values import resolved, type_hints
 from rlcli_isaaclab.user_files import (
     code_of,
     file_text,
@@ -105,7 +105,7 @@ class UserTerm:
         if len(declared) < self._skip and not any(p.kind is p.VAR_POSITIONAL for p in declared):
             expected = "(env, env_ids, ...)" if takes_env_ids else "(env, ...)"
             raise SignatureError(f"a term of {section} must take {expected}")
-        hints = _type_hints(call)
+        hints = type_hints(call)
         named = [p for p in declared[self._skip :] if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)]
         named = [p for p in named if p.name not in self.objects]
         self.parameters = [self._parameter(p, hints.get(p.name), entities) for p in named]
@@ -273,8 +273,8 @@ class _Bound:
             return torch.zeros(self._env.num_envs, device=self._env.device, dtype=dtype)
         if self._section == "observations" and value.dim() == 1:
             return value.unsqueeze(1).float()  # Isaac Lab allows (num_envs,) in groups that are not concatenated
-        if self._section == "observations" and value.dim() == 3:
-            return value.flatten(1)  # as Isaac Lab does for a term with a history
+        if self._section == "observations" and value.dim() not in (2, 4):
+            return value.flatten(1 if value.dim() == 3 else 3)  # a history, as in Isaac Lab; images (n, h, w, 1, 1)
         return value.bool() if self._section == "terminations" and value.dtype != torch.bool else value
 
 
@@ -299,6 +299,11 @@ class _BoundObject:
 
 class _BoundClass(_Bound, _BoundObject):
     """Term in one environment that calls an object of the user's class: a term with a state."""
+
+    def __call__(self, selection: Selection | None = None) -> Any:
+        if self._section == "observations":
+            return call_once_per_step(self._env.managed, [self.term], super().__call__)
+        return super().__call__(selection)
 
 
 class _BoundCommand(_BoundObject):
@@ -436,15 +441,5 @@ def _bind_term(term: UserTerm, env: Any, **params: Any) -> _Bound:
     if not term.is_class:
         return _Bound(placed(term.function, env.device), term.section, facade, values)
     with building(env):
-        cfg = ManagerTermBaseCfg(func=term.function, params=values)
-        instance = placed(term.function, env.device)(cfg=cfg, env=facade)
-    return _BoundClass(instance, term.section, facade, values)
-
-
-def _type_hints(call: Any) -> dict[str, Any]:
-    try:
-        return typing.get_type_hints(call)
-    except Exception:  # an annotation refers to a name imported under TYPE_CHECKING
-        known_types = {"float": float, "int": int, "bool": bool, "str": str, "SceneEntityCfg": SceneEntityCfg}
-        annotations: Mapping[str, Any] = getattr(call, "__annotations__", {})
-        return {name: known_types.get(a) if isinstance(a, str) else a for name, a in annotations.items()}
+        made = placed(term.function, env.device)(cfg=ManagerTermBaseCfg(func=term.function, params=values), env=facade)
+    return _BoundClass(made, term.section, facade, values)

@@ -31,6 +31,10 @@ STAGES = ("imports", "validates", "steps", "trains")
 ENVS, STEPS, ITERATIONS = 16, 200, 3
 LIMIT_S = 3600
 """Time for one task [s]; the slowest reset an inverse kinematics of their own for each episode."""
+LONGEST = 600
+"""Number of characters of a reason that a row keeps."""
+PLACE = re.compile(r"\.(py|ya?ml|toml|json):\d+|\[[^\]]+:\d+\]")
+"""File and line of a message."""
 OUTSIDE = ("pick_place",)
 """Packages that Isaac Lab does not import by default."""
 
@@ -109,7 +113,7 @@ def run(
         own = [f for f in frames if f.filename.startswith(str(package))] or frames
         is_bug = own and not isinstance(error, RlcliError)
         at = f" [{own[-1].filename.rpartition('/')[2]}:{own[-1].lineno}]" if is_bug else ""
-        return stage, f"{type(error).__name__}: {text[:600]}{at}", facts
+        return stage, f"{type(error).__name__}: {text[:LONGEST]}{at}", facts
     return stage, "", facts
 
 
@@ -295,8 +299,34 @@ def row_of(name: str, kwargs: dict[str, Any], *arguments: Any) -> tuple[str, dic
     return name, {**row, "seconds": round(time.time() - start), **facts}
 
 
+def faulty_messages(rows: dict[str, Any]) -> list[str]:
+    """Return the messages that lack a file and a line, or that are errors of Python instead of errors of rlcli.
+
+    An error of Python would point at the task's code for something that rlcli lacks. Missing modules of the task are
+    no such error: nobody but the task can have them.
+    """
+    import rlcli.errors
+
+    ours = {name for name, kind in vars(rlcli.errors).items() if isinstance(kind, type)}
+    found = []
+    for task, row in sorted(rows.items()):
+        kind, _, text = row["reason"].partition(": ")
+        if not text:
+            continue
+        messages = text.split(" || ")
+        is_cut = len(text) >= LONGEST
+        if kind == "RuntimeError":  # the end of a training's log
+            messages = re.findall(r"error: (.*)", text) or messages
+        wrong = [m for m in messages[: -1 if is_cut and len(messages) > 1 else None] if not PLACE.search(m)]
+        if kind not in (*ours, "RuntimeError", "ModuleNotFoundError"):
+            wrong = messages[:1]
+        found += [f"{task}: {kind}: {message}" for message in wrong]
+    return found
+
+
 def count(rows: dict[str, Any]) -> None:
-    """Print how many tasks pass each stage."""
+    """Print how many tasks pass each stage, and the messages that do not help."""
+    print(*(f"faulty message: {message}" for message in faulty_messages(rows)), sep="\n")
     for direct in (False, True):
         kind = [row for row in rows.values() if row["direct"] == direct]
         counts = {stage: sum(row["stage"] > i for row in kind) for i, stage in enumerate(STAGES)}

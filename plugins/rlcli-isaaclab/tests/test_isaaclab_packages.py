@@ -1,6 +1,7 @@
 """Packages built on Isaac Lab: folders on `sys.path`, libraries, actuators of their own, kinematic objects, ranges."""
 
 import dataclasses
+import sys
 import threading
 
 import pytest
@@ -448,3 +449,17 @@ def test_installed_package_that_imports_isaac_lab(tmp_path, monkeypatch):
     stepped(rover(tmp_path / "tasks", code))
     own = [name for name in ("installed_robots_of_test", "installed_numbers_of_test") if name in OWN_NAMES]
     assert own == ["installed_robots_of_test"]
+
+
+def test_installed_library_that_also_serves_a_framework_stays_itself(tmp_path, monkeypatch):
+    library = tmp_path / "site" / "warp"
+    library.mkdir(parents=True)
+    (library / "__init__.py").write_text("from warp.kernels import func\n")
+    (library / "kernels.py").write_text("def func(f):\n    return f\n")
+    (library / "usd.py").write_text("from pxr import Usd\nimport omni.usd\n")
+    monkeypatch.syspath_prepend(str(tmp_path / "site"))
+    for name in [name for name in sys.modules if name.partition(".")[0] == "warp"]:
+        monkeypatch.delitem(sys.modules, name)
+    stepped(rover(tmp_path / "rover", "import warp as wp\n\n@wp.func\ndef f(x):\n    return x\n"))
+    for name in [name for name in sys.modules if name.partition(".")[0] == "warp"]:
+        del sys.modules[name]

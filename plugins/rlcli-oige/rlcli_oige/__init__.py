@@ -1,8 +1,8 @@
-"""All names that OmniIsaacGymEnvs' tasks import, in one package: import them by `from rlcli_oige import ...`.
+"""Plugin that runs tasks of OmniIsaacGymEnvs, and the names that such tasks import: `from rlcli_oige import ...`.
 
-A name that this package does not have is searched in the Python files beside the importing file, and below the folder
-of the task's YAML. So a task's shared modules and view classes are imported from here too. Nothing is imported before
-a name is used: the check of a task's YAML does not import torch.
+If this package does not have a name, it searches the Python files beside the importing file and below the folder of the
+task's YAML. So a task can also import its own shared modules and view classes from here. Nothing is imported before a
+name is used: the check of a task's YAML does not import torch.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from rlcli_oige.yaml_translator import YamlTranslator
 
 @dataclass(slots=True)
 class Agent:
-    """Settings of the trainer `ppo`, and the position of each in the YAML."""
+    """Settings of the trainer `ppo`, and the position of each setting in the train YAML."""
 
     data: dict[str, Any]
     origin: Callable[[Path], Origin]
@@ -34,7 +34,7 @@ def translate(document: Document, label: str, root: Mapping[str, Any]) -> Agent:
     Args:
         document: the train YAML.
         label: name of the file in messages.
-        root: settings that its interpolations may refer to, with the evaluated task.
+        root: settings that interpolations in the train YAML may refer to, including the evaluated task.
 
     Raises:
         ConfigError: with every unknown key and every wrong value.

@@ -17,7 +17,7 @@ from rlcli_oige.views import XFormPrimView, select_rows
 
 
 class ArticulationView(XFormPrimView):
-    """Robots: one in each environment. Columns are the hinge and slide joints, breadth first.
+    """View of a robot in all environments. Columns are the hinge and slide joints, in breadth-first order.
 
     In shapes, n is the number of environments that `indices` selects, and k the number of columns that `joint_indices`
     selects (None: all).
@@ -171,7 +171,8 @@ class ArticulationView(XFormPrimView):
     def get_measured_joint_forces(self, indices: Any = None, joint_indices: Any = None, clone: bool = True) -> Tensor:
         """Return force and torque between each body and its parent, body frame. (n, bodies, 6) [N, N m]
 
-        The second dimension is bodies, breadth first, as in `body_names`. All are 0 before an episode's first step.
+        The second dimension has the bodies in breadth-first order, as `body_names`. All values are 0 before the first
+        step of an episode.
         """
         if self._wrench_columns is None:
             self._wrench_columns = self._find_force_sensors()
@@ -198,7 +199,7 @@ class ArticulationView(XFormPrimView):
         limits[rows[:, None], columns] = values.abs()
 
     def get_gains(self, indices: Any = None, joint_indices: Any = None, clone: bool = True) -> tuple[Tensor, Tensor]:
-        """Return stiffness and damping of the position drives; 0 for joints without one. (n, k) each"""
+        """Return stiffness and damping of the position drives; 0 for joints without a drive. (n, k) each"""
         stiffness, damping = torch.zeros_like(self._efforts), torch.zeros_like(self._efforts)
         joints, actuators, _ = self._drives["position"]
         bias = self.env.engine.expand("actuator_biasprm")[:, actuators].float()

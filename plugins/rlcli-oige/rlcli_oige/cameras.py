@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 SENSOR, SEGMENTATION = "oige_camera", "oige_segmentation"
 """Names of the camera sensors in the scene: colours, and ids of bodies."""
 _BACKGROUND, _UNLABELLED, _FIRST_LABELLED = range(3)
-"""Numbers in an image of instance segmentation: the background, objects without a label, the first labelled object."""
+"""Pixel values of an instance-segmentation image: background, objects without a label, first labelled object."""
 _APERTURE = 20.955
 """Width of a USD camera's film, if the task does not set it [mm]."""
 _FOCAL_LENGTH = 50.0
@@ -114,7 +114,7 @@ def _of_stage(prim: Prim, width: int, height: int) -> dict[str, Any]:
 
 
 def add_update_semantics(prim: Any, semantic_label: str, type_label: str = "class", suffix: str = "") -> None:
-    """Give a prim a semantic label: images of instance segmentation tell it from other prims."""
+    """Give a prim (an object of the scene) a semantic label, so that instance segmentation shows it separately."""
     get_current_stage().labelled.add(relative(prim.GetPath()))
 
 
@@ -138,7 +138,7 @@ class Camera(Counterpart):
         return float(near), float(far)
 
     def set_focal_length(self, value: float) -> None:
-        """Record the call: the MJCF's camera has the field of view."""
+        """Record that the call has no effect, because the camera in the MJCF sets the field of view."""
         self._focal_length = value
         note_ignored("Camera.set_focal_length", "the MJCF's camera has the field of view", lost=True)
 
@@ -148,7 +148,7 @@ class Camera(Counterpart):
 
 
 class Annotator(Counterpart):
-    """Replicator's annotator of instance segmentation, of the camera of one environment."""
+    """Annotator of instance segmentation, as in Replicator, for the camera of one environment."""
 
     def __init__(self, env: OigeEnv) -> None:
         self._env = env
@@ -193,7 +193,7 @@ def warp_to_torch(array: Tensor) -> Tensor:
 
 
 class Writer(Counterpart):
-    """Replicator's PytorchWriter. The listener reads the camera itself."""
+    """Replacement of Replicator's PytorchWriter. It does nothing, because the listener reads the camera itself."""
 
     def initialize(self, *args: Any, **kwargs: Any) -> None:
         """Do nothing."""
@@ -202,7 +202,7 @@ class Writer(Counterpart):
 
 
 class Listener(Counterpart):
-    """Replicator's PytorchListener, which gives a task the images of its camera in all environments."""
+    """Replacement of Replicator's PytorchListener: it returns the images of a task's camera in all environments."""
 
     def __init__(self, env: OigeEnv) -> None:
         self._env = env

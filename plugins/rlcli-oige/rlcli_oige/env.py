@@ -54,10 +54,10 @@ def _on_cpu(task_class: type) -> type:
 
 
 class OigeEnv(DirectEnv):
-    """Direct workflow for `RLTask`.
+    """Environment that runs an `RLTask`, a task class of OmniIsaacGymEnvs.
 
-    The task's reset flag is split into terminated and truncated, observations are clipped after the rewards are
-    computed, and external forces act for one step.
+    Differences from rlcli's direct tasks: the one reset flag of the task is split into terminated and truncated,
+    observations are clipped after the rewards are computed, and external forces act for one step.
     """
 
     task: RLTask
@@ -187,7 +187,7 @@ class OigeEnv(DirectEnv):
         self._log_ignored()
 
     def _class_sets_length(self) -> bool:
-        """Return whether the episode length in the task's class counts: `episode_length_s` was not set by the user."""
+        """Return whether the task's class sets the episode length: true unless the user has set `episode_length_s`."""
         origin = self.resolved.layers.origin(("episode_length_s",))
         return origin is not None and origin.layer == "task" and is_oige_file(self.resolved.source.config)
 
@@ -305,7 +305,7 @@ class OigeEnv(DirectEnv):
             return done, late
         if self._post_physics_is_own:  # its flags cannot be computed again
             return done & ~late, late
-        # evaluate is_done again with an early progress: flags that are still set do not depend on the time
+        # evaluate is_done again as if the episode had just begun: flags that are still set do not depend on the time
         flags, progress = task.reset_buf.clone(), task.progress_buf.clone()
         task.reset_buf.zero_()
         task.progress_buf.masked_fill_(late, 1)

@@ -20,17 +20,17 @@ class Composed(Document):
     """A parsed YAML document that is merged from several files."""
 
     labels: dict[Path, str] = field(default_factory=dict)
-    """Path of a key -> name of the file that has it."""
+    """Path of a key -> name of the file that sets the key."""
 
 
 def compose(document: Document, file: FilePath, label: str) -> Document:
     """Return a document with its `defaults:` list replaced by the content of the listed files.
 
-    Entries are merged in the order of the list; `_self_` is the document itself, which is last if the list does not
-    have it. A name means a YAML file beside the document, `/name` one in the folder above.
+    Entries are merged in the order of the list. `_self_` stands for the document itself; without this entry the
+    document is merged last. A name means a YAML file beside the document, `/name` a YAML file in the folder above.
 
     Raises:
-        ConfigError: for an entry that is no such file, or a file that lists itself.
+        ConfigError: if an entry names no such file, or a file lists itself.
     """
     if DEFAULTS not in document.data:
         return document

@@ -1,8 +1,8 @@
 """Evaluation of Hydra's interpolations in YAML: `${..seed}`, `${resolve_default:512,${...num_envs}}`.
 
-Only the syntax of OmniIsaacGymEnvs: relative and absolute references, and its four resolvers. Hydra itself is not used:
-its current release cannot be installed beside the current omegaconf, its errors have no line numbers, and its resolvers
-may read environment variables and import code.
+The module supports the syntax that OmniIsaacGymEnvs uses: relative and absolute references, and four resolvers
+(functions such as `resolve_default`). Hydra itself is not used: its current release cannot be installed beside the
+current omegaconf, its errors have no line numbers, and its resolvers may read environment variables and import code.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ class _Evaluator:
         return value
 
     def _text(self, path: Path, text: str) -> Any:
-        """Evaluate the interpolations of a text. A text that is one interpolation keeps the type of its value."""
+        """Evaluate the interpolations in a text. If the text is a single interpolation, its value keeps its type."""
         parts: list[Any] = []
         position = 0
         while position < len(text):

@@ -1,6 +1,6 @@
-"""Changes of a robot's MJCF model: settings of an actor in the YAML, and attributes of USD that a task has set.
+"""Changes of a robot's MJCF model that follow from the task's YAML, and from USD attributes that the task sets.
 
-An actor is a robot or object in OmniIsaacGymEnvs' words. A USD schema is a group of attributes, such as `DriveAPI`.
+In OmniIsaacGymEnvs an actor is a robot or an object. A USD schema is a group of attributes, such as `DriveAPI`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ FRAME, FORCE, TORQUE = ".frame", ".joint_force", ".joint_torque"
 
 
 _STIFF = 10.0
-"""A drive is stiff if its implicit inertia (dt kd + dt^2 kp) is more than this many times that of the joint."""
+"""A drive is stiff if its implicit inertia (dt kd + dt^2 kp) is more than this many times the inertia of the joint."""
 
 
 def apply_schemas(prim: Prim, dt: float) -> bool:
@@ -72,8 +72,8 @@ def _apply_to_joint(prim: Prim, joint: Any, values: dict[tuple[str, str, str], A
 
     PhysX integrates drives implicitly: (M + A) dv = dt (kp (target - q - dt v) - kd v) with A = dt kd + dt^2 kp.
     MuJoCo's Euler step of an actuator with damping kd + dt kp at a joint with armature A is the same equation. PhysX
-    limits the force at the end of the step, MuJoCo at its start, where that of a stiff drive is much larger: such a
-    drive gets no limit.
+    limits the force at the end of the step. MuJoCo limits the force at the start of the step, where the force of a
+    stiff drive is much larger; so stiff drives get no limit.
     """
     hinge = joint.type == mujoco.mjtJoint.mjJNT_HINGE
     per_unit = 180.0 / math.pi if hinge else 1.0

@@ -28,7 +28,7 @@ _CONSTANTS = ("body_masses", "body_inertias", "mass", "density", "inertia", "joi
 
 
 class Randomizer:
-    """Domain randomisation of a task, which finds it as `self._dr_randomizer`; the environment calls its methods.
+    """Domain randomisation of a task. The task reads this object as `self._dr_randomizer`; the environment calls it.
 
     A task may call `set_up_domain_randomization`, `dr.physics_view.step_randomization` and the like. They do nothing:
     the environment randomises at the right moments.
@@ -170,7 +170,7 @@ class Randomizer:
             self._add_noise("observations", obs)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return the tensors that a checkpoint holds: the current noise, and the values from which episodes start."""
+        """Return the tensors to save: the current noise, and the values from which episodes start."""
         found = {f"held.{name}": value.clone() for name, value in self._episode_noise.items()}
         found |= {f"noisy.{name}": value.clone() for name, value in self._step_noise.items()}
         for path, field in self._fields.items():
@@ -211,7 +211,7 @@ class Randomizer:
         Args:
             entry: attribute and distribution.
             ids: environments.
-            step: environment step that keys the samples of `on_interval`; None: the episode index keys them.
+            step: environment step on which the samples of `on_interval` depend; None: they depend on the episode index.
             size: number of values per environment.
             shape: shape of the values of one environment.
         """

@@ -26,7 +26,8 @@ ROOT_AND_JOINT_STATE = (
     "joint_positions",
     "joint_velocities",
 )
-"""Attributes of the state: an operation acts on the current value, not on the initial value."""
+"""Attributes that belong to the state of the simulation: an operation changes their current value, not the initial
+one."""
 
 
 class RandomizedField:
@@ -87,7 +88,7 @@ def _apply_rotation(operation: str, current: Tensor, sample: Tensor) -> Tensor:
 
 
 def make_field(path: tuple[str, ...], env: OigeEnv) -> RandomizedField:
-    """Return the reader and writer of a randomised attribute.
+    """Return the object that reads and writes a randomised attribute.
 
     Args:
         path: (simulation, gravity) or (kind of view, view, attribute).

@@ -1,7 +1,7 @@
-"""Modules that the import lines of task files get: `omni.*`, `pxr`, `carb`, `gym`, `hydra`, `omniisaacgymenvs.*`.
+"""Replacements of modules that task files import: `omni.*`, `pxr`, `carb`, `gym`, `hydra`, `omniisaacgymenvs.*`.
 
-A name that `rlcli_oige` has is imported from there, whatever module the task names. Names whose calls have no effect in
-MuJoCo are recorded when they are called; all others can be imported and raise an error when they are used.
+If `rlcli_oige` has a name, the task gets that object, whatever module the task imports it from. Calls of functions
+without an effect in MuJoCo are recorded. All other names can be imported; their use raises an error.
 """
 
 from __future__ import annotations
@@ -49,17 +49,17 @@ _REFUSED = {
     " bodies",
     "omniisaacgymenvs.tasks.warp": "tasks with Warp arrays are not supported; use the task's torch version",
 }
-"""Module of the user's package -> why a task that imports it cannot run."""
+"""Module of the task's package -> why a task that imports the module cannot run."""
 
 
 def find(name: str, file: str = "") -> ModuleType:
-    """Return the module that an import line in a task's file gets.
+    """Return the replacement of a module that a task's file imports.
 
     Raises:
         TaskError: for a module that no task of rlcli can use.
     """
     if name not in _modules:
-        module = _modules[name] = (_Neighbours if name.split(".")[0] == "omniisaacgymenvs" else _Module)(name)
+        module = _modules[name] = (_TaskModule if name.split(".")[0] == "omniisaacgymenvs" else _Module)(name)
         parent, _, last = name.rpartition(".")
         if parent:
             setattr(find(parent), last, module)
@@ -80,7 +80,7 @@ def find_numpy(name: str, file: str = "") -> ModuleType | None:
 
 
 def find_hydra(name: str, file: str = "") -> ModuleType | None:
-    """Return a module whose names raise an error when they are used, for `hydra` in a file of OmniIsaacGymEnvs.
+    """Return the replacement of `hydra` for a file of OmniIsaacGymEnvs: the use of its names raises an error.
 
     The same for `omegaconf` if it is not installed; None in all other cases.
     """
@@ -110,7 +110,7 @@ def _line_without_counterpart(file: Path) -> int:
 
 
 class _Module(ModuleType):
-    """A module of Omniverse or USD."""
+    """Replacement of a module of Omniverse or USD."""
 
     def __getattr__(self, name: str) -> Any:
         vocabulary = importlib.import_module("rlcli_oige.vocabulary")
@@ -134,8 +134,8 @@ class _Module(ModuleType):
         return missing(self.__name__, name, *(() if reason is None else (reason,)))
 
 
-class _Neighbours(_Module):
-    """A module of `omniisaacgymenvs`, for files outside of that package: its names are searched in the task's files."""
+class _TaskModule(_Module):
+    """Module `omniisaacgymenvs.*` for files outside of that package. Its names come from the task's files."""
 
     def _without_counterpart(self, name: str) -> Any:
         return name_lookup.find(name, importlib.import_module("rlcli_oige.vocabulary").NAMES)

@@ -1,4 +1,4 @@
-"""Rotations (w, x, y, z) under the names of Isaac Sim's torch utilities. TorchScript can compile all functions."""
+"""Functions on quaternions (w, x, y, z), named as Isaac Sim's torch utilities. TorchScript can compile all of them."""
 
 import math
 
@@ -182,12 +182,12 @@ def tf_inverse(q: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def tf_apply(q: Tensor, t: Tensor, v: Tensor) -> Tensor:
-    """Return the point v rotated by q and moved by t. (..., 3)"""
+    """Return the point v, rotated by the quaternion q and moved by the vector t. (..., 3)"""
     return quat_rotate(q, v) + t
 
 
 def tf_vector(q: Tensor, v: Tensor) -> Tensor:
-    """Return the direction v rotated by q; t is not used. (..., 3)"""
+    """Return the direction v, rotated by the quaternion q; t is not used. (..., 3)"""
     return quat_rotate(q, v)
 
 
@@ -232,8 +232,8 @@ def compute_heading_and_up(
     """Return how upright a torso is, and how well it faces a target.
 
     Returns:
-        Orientation since the start (n, 4); the up axis' component `up_idx` (n,); the cosine between heading and
-        target (n,); the up axis (n, 3); the heading (n, 3).
+        Orientation relative to the start (n, 4); component `up_idx` of the up axis (n,); the cosine between heading and
+            direction to the target (n,); the up axis (n, 3); the heading (n, 3).
     """
     torso_quat = quat_mul(torso_rotation, inv_start_rot)
     up_vec = quat_rotate(torso_quat, vec1)

@@ -35,7 +35,7 @@ class XFormPrim(Counterpart):
         self._build(scale)
 
     def _build(self, scale: Any) -> None:
-        """Fill the prim with the model of the USD file that the task refers to at its path."""
+        """Load the model that replaces the USD file to which the task refers at the path of the prim."""
         stage = self.prim.stage
         if self.prim.owner.prim_path in stage.references and self.prim.owner.child is None:
             stage.load(self.prim.owner, [kind.__name__ for kind in type(self).__mro__])
@@ -104,7 +104,7 @@ class Ingenuity(Robot):
 
 
 class RigidPrim(XFormPrim):
-    """A rigid object on the stage; its model is that of the USD file which the task has loaded at its path."""
+    """Rigid object on the stage. The task has loaded a USD file at its path; an MJCF replaces that file."""
 
 
 class _Shape(XFormPrim):
@@ -197,7 +197,7 @@ class FixedCylinder(_Cylinder):
 
 
 class Cloner(Counterpart):
-    """Copier of prims. The environments themselves are copied by rlcli."""
+    """Replacement of Isaac Sim's Cloner: it copies prims inside an environment. rlcli copies the environments."""
 
     def __init__(self, spacing: float = 0.0, *args: Any, **kwargs: Any) -> None:
         self.spacing = spacing
@@ -236,7 +236,7 @@ class Cloner(Counterpart):
 
 
 class GridCloner(Cloner):
-    """Copier of environments on a grid, with the positions that rlcli has."""
+    """Replacement of Isaac Sim's GridCloner; rlcli itself places the environments on a grid."""
 
 
 class GroundPlane:

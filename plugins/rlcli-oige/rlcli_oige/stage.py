@@ -33,7 +33,7 @@ _CURRENT_STAGES: list[Stage] = []
 
 
 class Prim(Counterpart):
-    """An object of the stage: a model, or a body or joint of a model, or a frame.
+    """Object of the stage (USD's word is prim): a model, a body or joint of a model, or a frame.
 
     The prims of models are those of the first environment; every environment has a copy.
     """
@@ -50,7 +50,7 @@ class Prim(Counterpart):
         self.pos: tuple[float, ...] = (0.0, 0.0, 0.0)
         self.quat: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0)
         self.given: set[str] = set()
-        """Which of `pos` and `quat` the task gives; the model has the others."""
+        """Which of `pos` and `quat` the task has set; the model has the value of the other one."""
         self.names: dict[str, Mapping[str, str]] = {}
         self.kind = ""
         """Type of the prim in USD, for prims without a model."""
@@ -125,7 +125,7 @@ class Prim(Counterpart):
         return [self._part(f"{self.prim_path}/{body.name}", body) for body in child.bodies[1:]]
 
     def part(self, path: str) -> Prim:
-        """Return the body or joint of the model that the last part of a path names; the prim is invalid if none is."""
+        """Return the body or joint that the last part of a path names; an invalid prim if there is none."""
         name = path.rpartition("/")[2]
         assert self.child is not None
         below_joints = path.removeprefix(self.prim_path).count("/") > 1
@@ -315,7 +315,7 @@ class Stage(Counterpart):
             _add_joint(scene, joint)
 
     def note_ignored(self, what: str, reason: str, lost: bool = False) -> None:
-        """Record a call without effect in MuJoCo, to log all at once; `lost`: with a warning, OIGE's motion differs."""
+        """Record a call without effect in MuJoCo, to log it later; `lost`: its effect would change the motion."""
         (self.lost if lost else self.ignored).setdefault(what, f"{user_location()}{reason}")
 
     def _rename_elements(self, prim: Prim, where: str) -> None:

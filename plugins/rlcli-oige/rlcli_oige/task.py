@@ -1,4 +1,4 @@
-"""`RLTask`, and the objects that its constructor receives: the settings, and the environment as tasks expect it."""
+"""`RLTask`, the base class of OmniIsaacGymEnvs' tasks, and the objects that it receives: settings and environment."""
 
 from __future__ import annotations
 
@@ -184,7 +184,7 @@ class SceneRegistry(Counterpart):
 
 
 class SimulationContext(Counterpart):
-    """The simulation as a task steps it by itself, within `pre_physics_step`."""
+    """Simulation that a task may step by itself, within `pre_physics_step`."""
 
     _env: OigeEnv
 
@@ -194,7 +194,7 @@ class SimulationContext(Counterpart):
 
 
 class World(SimulationContext):
-    """The simulation, with the methods that tasks call."""
+    """Simulation, with the methods of Isaac Sim's World that tasks call."""
 
     def __init__(self, env: OigeEnv) -> None:
         self._env = env
@@ -248,7 +248,7 @@ class World(SimulationContext):
 
 
 class EnvHandle(Counterpart):
-    """The environment as tasks expect it in `self._env`."""
+    """Object that tasks read as `self._env`: the environment with the attributes of OmniIsaacGymEnvs."""
 
     def __init__(self, env: OigeEnv) -> None:
         self.runner = env

@@ -50,7 +50,7 @@ def is_oige_file(file: FilePath) -> bool:
 
 
 def task_name(file: FilePath) -> str | None:
-    """Return the name of a task of OmniIsaacGymEnvs, imported or not; None for a file of another task."""
+    """Return the name of a task from a YAML of OmniIsaacGymEnvs, imported or not; None for another file."""
     try:
         data = _composed_data(file)
     except ConfigError:
@@ -69,7 +69,7 @@ def translate(
     Args:
         document: the task YAML.
         label: name of the file in messages.
-        class_file: source of the task's class; an episode length that is only in the class is read from it.
+        class_file: source file of the task's class; if the YAML has no episode length, it is read from this file.
         class_name: name of the class.
         agent_file: the agent's YAML.
 

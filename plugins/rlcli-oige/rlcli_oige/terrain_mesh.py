@@ -20,8 +20,9 @@ _BASE = 1.0
 def add_terrain(scene: Scene, prim: Prim) -> None:
     """Add the mesh of a prim to the scene.
 
-    The mesh must be a grid: rows of x, columns of y, two triangles for each cell. A vertex may be up to one cell off
-    its place, as where a slope is replaced by a vertical wall; the height field has the slope.
+    The mesh must be a grid: rows of x, columns of y, two triangles for each cell. A vertex may be up to one cell away
+    from its place on the grid, as in meshes in which vertical walls replace steep slopes. The height field has the
+    slope.
 
     Raises:
         TaskError: for another mesh.

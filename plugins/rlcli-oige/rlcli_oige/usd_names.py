@@ -105,7 +105,7 @@ class Quaternion:
 
 
 class Transform:
-    """Pose of a prim of the first environment in the world, with the joints of its model at 0."""
+    """World pose of a prim of the first environment, with all joints of its model at 0."""
 
     def __init__(self, prim: Prim) -> None:
         owner = prim.owner

@@ -1,4 +1,4 @@
-"""USD's schemas on prims: drives, limits, masses and gravity act on the model, others are recorded as ignored.
+"""Replacement of USD's schemas: drives, limits, masses and gravity change the model, others are logged as ignored.
 
 A schema is a class with USD's generated methods: `Apply`, `Get`, `Define`, `GetXAttr`, `CreateXAttr`, `CreateXRel`.
 """
@@ -45,7 +45,7 @@ _REFUSED = {
 
 
 class Attribute:
-    """An attribute of a prim: its value, and how USD names it (schema, instance of the schema, name)."""
+    """Attribute of a prim: its value, and its name in USD (schema, instance of the schema, name)."""
 
     def __init__(self, prim: Prim, schema: str, instance: str, name: str) -> None:
         self.prim, self.schema, self.instance, self.name = prim, schema, instance, name

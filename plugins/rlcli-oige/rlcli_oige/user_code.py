@@ -1,4 +1,4 @@
-"""Location of the user's code that is running, for messages, and errors for names that this package lacks."""
+"""Location of the task's code that is running, for messages, and errors for attributes that rlcli's classes lack."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class MissingAttributeError(TaskError, AttributeError):
 
 
 class Counterpart:
-    """Base of the classes that replace a class of Isaac Sim.
+    """Base class of the classes that replace a class of Isaac Sim.
 
     The use of an attribute that the replacement lacks raises an error with the user's line.
     """

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 class XFormPrimView(Counterpart):
-    """Frames or bodies that a path expression matches, in every environment. Rows are ordered by environment.
+    """View of the frames or bodies that a path expression matches in each environment. Rows are ordered by environment.
 
     Args:
         prim_paths_expr: a path whose steps may be regular expressions: `/World/envs/.*/Ant/torso`.
@@ -167,7 +167,7 @@ class XFormPrimView(Counterpart):
                     self._write("qpos", rows, slice(entity.root_qpos + start, entity.root_qpos + start + size), new)
 
     def get_velocities(self, indices: Any = None, clone: bool = True) -> Tensor:
-        """Return velocities of the centres of mass (as PhysX) and angular ones, world frame. (n, 6) [m/s, rad/s]"""
+        """Return linear velocities of the centres of mass and angular velocities, world frame. (n, 6) [m/s, rad/s]"""
         found = []
         for entity, body, root in zip(self._entities, self._bodies, self._roots, strict=True):
             if root and entity.root_dof is not None and entity.root_qpos is not None:
@@ -247,7 +247,7 @@ class XFormPrimView(Counterpart):
         return torch.as_tensor(indices, device=self.env.device).long().reshape(-1)
 
     def _rows_of(self, which: int, indices: Any) -> tuple[Tensor, Any]:
-        """Pick one body's rows from the view's row numbers `indices` (None: all).
+        """Return the rows of one body among the view's row numbers `indices` (None: all).
 
         `which` is the number of the body among the view's bodies in an environment.
 
@@ -274,7 +274,7 @@ class XFormPrimView(Counterpart):
 
 
 class RigidPrimView(XFormPrimView):
-    """Bodies: links of robots, or single bodies."""
+    """View of bodies: links of robots, or single bodies."""
 
     def __init__(
         self, prim_paths_expr: str, name: str = "rigid_prim_view", reset_xform_properties: bool = True,
@@ -345,7 +345,7 @@ class RigidPrimView(XFormPrimView):
 
     def enable_gravities(self, indices: Any = None) -> None:
         """Turn gravity on for the bodies of some rows (indices); None: all rows."""
-        if self.env.engine.model.ngravcomp:  # else the model has no gravity compensation, so gravity is on
+        if self.env.engine.model.ngravcomp:  # otherwise the model has no gravity compensation, so gravity is on already
             self._set_gravity_compensation(0.0, indices)
 
     def disable_gravities(self, indices: Any = None) -> None:

@@ -1,5 +1,5 @@
 # ruff: noqa: F401
-"""All names that `rlcli_oige` defines, in one module. `rlcli_oige` imports it when a name is first used."""
+"""Names that `rlcli_oige` exports, collected in one module, which is imported when a name is first used."""
 
 from rlcli_oige.articulation_view import ArticulationView
 from rlcli_oige.cameras import Camera, add_update_semantics

@@ -1,4 +1,4 @@
-"""Base of the translators of OmniIsaacGymEnvs' YAML files: records values, their sources, notes and mistakes."""
+"""Base class of the translators of OmniIsaacGymEnvs' YAML files. It records values, sources, notes and mistakes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rlcli_oige.hydra_defaults import label_at
 
 @dataclass(slots=True)
 class YamlTranslator:
-    """Base of a translator of one YAML file: the settings translated so far, and notes and mistakes for the user."""
+    """Base class of a translator of one YAML file: translated settings, and notes and mistakes for the user."""
 
     document: Document
     label: str

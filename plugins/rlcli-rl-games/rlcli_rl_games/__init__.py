@@ -1,1 +1,1 @@
-"""rl_games as a trainer of rlcli."""
+"""Plugin with the trainer `rl-games`: PPO and SAC of the library rl_games."""

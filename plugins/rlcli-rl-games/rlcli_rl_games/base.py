@@ -231,7 +231,7 @@ def mean_of(values: list[Any]) -> float:
 
 
 def _with_none_activations(value: Any) -> Any:
-    """Return a copy of settings with the string "None", which rl_games expects, in place of null activations."""
+    """Return a copy of settings in which null activations are the string "None", as rl_games expects."""
     if isinstance(value, dict):
         return {
             key: "None" if item is None and "activation" in key else _with_none_activations(item)

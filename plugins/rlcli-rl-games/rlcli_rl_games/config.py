@@ -44,7 +44,7 @@ IGNORED: Mapping[str, str] = {
 
 
 class _Settings(StrictModel):
-    """Base of settings: keys of rl_games without effect in rlcli (`IGNORED`) are dropped before validation."""
+    """Base class of the settings; before validation it drops keys of rl_games that have no effect here (`IGNORED`)."""
 
     @model_validator(mode="before")
     @classmethod
@@ -75,7 +75,7 @@ class MlpConfig(StrictModel):
 
 
 class ContinuousConfig(StrictModel):
-    """Settings of the normal distribution from which continuous actions are sampled."""
+    """Settings of the normal distribution from which actions are sampled."""
 
     mu_activation: Nothing = None
     """Activation on the mean: only null."""
@@ -275,7 +275,7 @@ class SacSettings(_Settings):
     learnable_temperature: bool
     """Whether the temperature is trained."""
     target_entropy_coef: Positive = 1.0
-    """The target entropy is minus this factor times the number of action dimensions."""
+    """Factor of the target entropy, which is minus this factor times the number of action dimensions."""
     alpha_lr: Positive
     """Learning rate of the temperature."""
     actor_lr: Positive

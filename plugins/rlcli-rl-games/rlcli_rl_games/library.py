@@ -1,4 +1,4 @@
-"""The parts of rl_games that the trainers use, imported without its warnings and without its output."""
+"""The classes of rl_games that the trainers use. The import suppresses rl_games' warnings and output."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ from rlcli_rl_games.config import PpoConfig
 from rlcli_rl_games.library import A2CAgent, NullWriter
 
 _DEFAULTS = {"lr_schedule": None, "bounds_loss_coef": 0.0}
-"""Keys without which rl_games' PPO fails, with values that have no effect."""
+"""Keys of `params.config` that rl_games' PPO requires -> value without effect, for settings that lack the key."""
 
 
 class PpoTrainer(RlGamesTrainer):

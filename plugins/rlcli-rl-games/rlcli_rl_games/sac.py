@@ -20,7 +20,9 @@ _COLUMNS = ("obses", "actions", "rewards", "next_obses", "dones")
 
 
 class ReplayBuffer(VectorizedReplayBuffer):
-    """rl_games' replay buffer with correct time-outs: not done, with the episode's last observation as the next one.
+    """Replay buffer of rl_games with correct time-outs.
+
+    A time-out is stored as not done, with the last observation of the episode as the next observation.
 
     Args:
         vec: the environment.

@@ -1,1 +1,1 @@
-"""RSL-RL's PPO as a trainer of rlcli."""
+"""Plugin with the trainer `rsl-rl`: PPO of the library RSL-RL."""

@@ -23,16 +23,16 @@ _NO_GROUPS: dict[str, list[str]] = {}
 
 
 class PolicyConfig(StrictModel):
-    """Both networks, in the form of RSL-RL up to 4 and of Isaac Lab."""
+    """Settings of the actor's and the critic's network, in the form of Isaac Lab and of RSL-RL up to version 4."""
 
     class_name: Literal["ActorCritic", "ActorCriticRecurrent"] = "ActorCritic"
-    """ActorCriticRecurrent: with an LSTM before each network."""
+    """Kind of the networks; ActorCriticRecurrent has an LSTM before each network."""
     init_noise_std: Positive = 1.0
     """Standard deviation of the untrained policy."""
     noise_std_type: Literal["scalar", "log"] = "scalar"
     """scalar: train the standard deviation; log: train its logarithm."""
     state_dependent_std: Literal[False] = False
-    """Only false: the standard deviation does not depend on the state."""
+    """Whether the standard deviation depends on the state; only false is supported."""
     actor_obs_normalization: bool | None = None
     """Normalise the actor's observations by running mean and standard deviation; null: use empirical_normalization."""
     critic_obs_normalization: bool | None = None
@@ -52,7 +52,7 @@ class PolicyConfig(StrictModel):
 
 
 class DistributionConfig(StrictModel):
-    """The distribution of actions, in the form of RSL-RL 5."""
+    """Settings of the distribution from which actions are sampled, in the form of RSL-RL 5."""
 
     class_name: Literal["GaussianDistribution"] = "GaussianDistribution"
     """The network gives the mean; the standard deviation does not depend on the state."""
@@ -67,10 +67,10 @@ class DistributionConfig(StrictModel):
 
 
 class ModelConfig(StrictModel):
-    """A network, in the form of RSL-RL 5."""
+    """Settings of one network (actor or critic), in the form of RSL-RL 5."""
 
     class_name: Literal["MLPModel", "RNNModel"] = "MLPModel"
-    """RNNModel: with an LSTM before the network."""
+    """Kind of the network; RNNModel has an LSTM before its hidden layers."""
     hidden_dims: Widths = _WIDE
     """Widths of the hidden layers."""
     activation: Activation = "elu"
@@ -95,7 +95,7 @@ class WeightScheduleConfig(StrictModel):
     initial_step: NotNegative | None = None
     """Step at which the linear change begins."""
     final_step: NotNegative | None = None
-    """Step at which the linear change ends, or of the jump."""
+    """Step at which the linear change ends, or at which the weight jumps to its final value."""
     final_value: NotNegative | None = None
     """Weight after final_step."""
 
@@ -110,7 +110,7 @@ class WeightScheduleConfig(StrictModel):
 
 
 class RndConfig(StrictModel):
-    """Random network distillation (Burda et al. 2018): a reward for states that are new."""
+    """Settings of random network distillation (Burda et al. 2018), a reward for states that are new (curiosity)."""
 
     weight: NotNegative = 0.0
     """Weight of the curiosity reward; RSL-RL multiplies it by the step time."""
@@ -123,7 +123,7 @@ class RndConfig(StrictModel):
     learning_rate: Positive = 1e-3
     """Learning rate of the predictor."""
     num_outputs: Count = 1
-    """Number of outputs of target and predictor."""
+    """Number of outputs of both networks: the fixed random target, and the predictor that learns its outputs."""
     predictor_hidden_dims: Annotated[list[int], Field(min_length=1)] = _AS_WIDE_AS_THE_INPUT
     """Widths of the predictor; -1: as wide as its input."""
     target_hidden_dims: Annotated[list[int], Field(min_length=1)] = _AS_WIDE_AS_THE_INPUT
@@ -133,7 +133,7 @@ class RndConfig(StrictModel):
 
 
 class SymmetryConfig(StrictModel):
-    """Use of the task's mirror symmetry in the update (Mittal et al. 2024)."""
+    """Settings of the use of a task's mirror symmetry in the update (Mittal et al. 2024)."""
 
     data_augmentation_func: str
     """`module:function` of the task's package or a plugin's, or `file.py:function` beside the task, called as
@@ -142,7 +142,7 @@ class SymmetryConfig(StrictModel):
     use_data_augmentation: bool = False
     """Also train on mirrored samples."""
     use_mirror_loss: bool = False
-    """Add a loss for actions that are not symmetric."""
+    """Add a loss on the difference between the action in a mirrored state and the mirrored action."""
     mirror_loss_coeff: NotNegative = 0.0
     """Weight of the mirror loss."""
 
@@ -151,7 +151,7 @@ class AlgorithmConfig(StrictModel):
     """Settings of the PPO update."""
 
     class_name: Literal["PPO"] = "PPO"
-    """Proximal policy optimisation."""
+    """Name of RSL-RL's algorithm class, for proximal policy optimisation."""
     num_learning_epochs: Count = 5
     """Epochs per iteration."""
     num_mini_batches: Count = 4
@@ -202,7 +202,7 @@ class RunnerConfig(AgentConfig):
     """Settings of a training: the keys of `RslRlOnPolicyRunnerCfg`, and those of every agent of rlcli."""
 
     algorithm: AlgorithmConfig = AlgorithmConfig()  # type: ignore[assignment]
-    """The update; `ppo`: RSL-RL's defaults."""
+    """Settings of the update; `ppo` means RSL-RL's defaults."""
     bootstrap: Literal["final_obs", "pre_step"] = "final_obs"
     """Return after a time-out: gamma times the value of the last observation of the episode, or, as in RSL-RL
     itself, of the observation before the step."""
@@ -210,7 +210,7 @@ class RunnerConfig(AgentConfig):
     """Actions are clipped to +-this value in training, play and export alike; null: unbounded. RSL-RL's name of this
     key, `clip_actions`, is accepted, too."""
     class_name: Literal["OnPolicyRunner"] = "OnPolicyRunner"
-    """Name of RSL-RL's runner."""
+    """Name of RSL-RL's runner class."""
     num_steps_per_env: Count = 24
     """Steps per environment and iteration."""
     obs_groups: dict[str, Annotated[list[str], Field(min_length=1)]] = _NO_GROUPS
@@ -218,7 +218,7 @@ class RunnerConfig(AgentConfig):
     (`rnd_state`) observe. Default: the critic observes the group critic if the task has one, else policy; the others
     observe policy."""
     policy: PolicyConfig | None = None
-    """Both networks, in the older form; if actor and critic are null too: RSL-RL's defaults."""
+    """Settings of both networks in the older form. If actor and critic are null as well, RSL-RL's defaults are used."""
     actor: ModelConfig | None = None
     """Actor network, in the form of RSL-RL 5."""
     critic: ModelConfig | None = None
@@ -308,7 +308,7 @@ class RunnerConfig(AgentConfig):
     def memory(self) -> list[int] | None:
         """Number of cells in each recurrent layer of the actor.
 
-        The list is empty if only the critic is recurrent; None: neither network is.
+        The list is empty if only the critic is recurrent. The value is None if neither network is recurrent.
         """
         actor, critic = self.networks
         if "RNNModel" not in (actor.class_name, critic.class_name):

@@ -78,7 +78,7 @@ class RslRlTrainer(BaseTrainer):
         self.keep_recent_obs(obs["policy"])
 
     def iterate(self) -> Report:
-        """Collect experience, then update."""
+        """Run one iteration: collect a rollout, then update the networks."""
         before, begin = dict(self.env.seconds), time.perf_counter()
         torch.set_num_threads(1)
         self._collect()
@@ -337,7 +337,7 @@ def _network(config: Any) -> dict[str, Any]:
 
 
 def _mirror(env: Environment, reference: str) -> Any:
-    """Import the user's function that mirrors observations and actions (`data_augmentation_func`).
+    """Import the user's function that appends mirror images of observations and actions (`data_augmentation_func`).
 
     Args:
         env: the environment.

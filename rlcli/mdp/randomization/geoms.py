@@ -24,8 +24,8 @@ class RandomizeGeomFriction(AxisRandomization, GeomTerm):
     """Random friction of geoms: axis 0 is sliding, axis 1 torsional [m], axis 2 rolling [m].
 
     In a contact of two geoms with equal priority MuJoCo uses the larger friction, so a lower one would have no effect.
-    With `prevail` the chosen geoms therefore get a higher priority than all others. In their contacts their `condim`,
-    `solref` and `solimp` then hold, too.
+    With `prevail` the chosen geoms therefore get a higher priority than all others. MuJoCo then also uses their
+    `condim`, `solref` and `solimp` in their contacts.
     """
 
     model_field = "geom_friction"

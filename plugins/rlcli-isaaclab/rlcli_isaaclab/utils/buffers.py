@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import copy
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
+
+T = TypeVar("T")
 
 
 class CircularBuffer:
@@ -127,3 +131,30 @@ def set_tensors(holder: object, tensors: Mapping[str, Tensor]) -> None:
             set_tensors(getattr(holder, name), {inner: value})
         else:
             setattr(holder, name, value.clone())
+
+
+def call_without_effects(holders: Sequence[object], function: Callable[[], T]) -> T:
+    """Call a function, and then restore the attributes of objects, and torch's random generator.
+
+    Buffers, and tensors in lists, dicts and other containers of the objects, get their values back, too.
+    """
+    saved = [(vars(holder), dict(vars(holder))) for holder in holders]
+    for _, attributes in saved:
+        saved += [(vars(v), dict(vars(v))) for v in attributes.values() if isinstance(v, CircularBuffer | DelayBuffer)]
+    values = [value for _, attributes in saved for value in attributes.values()]
+    containers = [(value, copy.copy(value)) for value in values if isinstance(value, list | dict | set | deque)]
+    values += [item for _, items in containers for item in (items.values() if isinstance(items, dict) else items)]
+    tensors = [(value, value.clone()) for value in values if isinstance(value, Tensor)]
+    generator = torch.get_rng_state()
+    found = function()
+    for attributes, before in saved:
+        attributes.clear()
+        attributes.update(before)
+    for container, items in containers:
+        container.clear()
+        container.update(items) if isinstance(container, dict | set) else container.extend(items)
+    for tensor, value in tensors:
+        if not torch.equal(tensor, value):
+            tensor.copy_(value)
+    torch.set_rng_state(generator)
+    return found
