@@ -274,7 +274,10 @@ class DirectEnv(VecEnv):
         return found
 
     def episode_dependencies(self) -> list[str]:
-        """Add the class of the direct task: it may keep any state, so an episode may depend on earlier ones."""
+        """Return the parts of the task that make an episode depend on earlier ones, always with the task's class.
+
+        The class may keep any state from one episode to the next.
+        """
         return [*super().episode_dependencies(), f"the class {type(self.task).__name__}"]
 
     def _before_full_reset(self) -> None:

@@ -59,7 +59,7 @@ class StressResult:
 
     @property
     def variants(self) -> dict[Point, Summary]:
-        """Values of the parameters -> summary, for every variant of the grid and of the search."""
+        """Summaries of all variants, of the grid and of the search, by the values of the parameters."""
         return {**self.grid, **self.searched}
 
     @property

@@ -233,7 +233,7 @@ class Checkpoint:
         return TrainerState(tensors, values, {name: self._rows(name) for name in self.shards()})
 
     def verify(self, *, whole: bool) -> None:
-        """Read and check the policy, or with `whole` all that is needed to resume the training.
+        """Read and check the policy; with `whole` also everything else that is needed to resume the training.
 
         Raises:
             CheckpointError: at the first error.

@@ -265,7 +265,7 @@ def _mlp_policy(
         "action_bound": action_bound,
     }
     actor: dict[str, Tensor] = {}
-    for number, (weight, bias) in enumerate(layers):  # activations have the odd numbers
+    for number, (weight, bias) in enumerate(layers):  # the modules with odd numbers are activations
         actor |= {f"actor.{2 * number}.weight": weight, f"actor.{2 * number}.bias": bias}
     return spec, actor
 

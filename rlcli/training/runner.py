@@ -262,7 +262,7 @@ def _report_bar(run: Run, bar: str, reached: bool) -> None:
     if reached:
         _log.info(f"{bar} reached after {step:,} steps and {seconds:.1f} s of rollouts and updates")
     else:
-        why = "in no evaluation did the lower end of the 95 % interval reach it"
+        why = "the lower end of the 95 % interval did not reach it in any evaluation"
         _log.warning(f"{bar} was not reached in {step:,} steps: {why}")
 
 

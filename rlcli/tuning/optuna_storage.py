@@ -148,7 +148,7 @@ def _journal(folder: Path, create: bool) -> optuna.storages.BaseStorage:
         return JournalStorage(Backend(str(file), lock_obj=lock))
     except (RlcliError, OSError, MemoryError):
         raise
-    except Exception as error:  # Optuna raises many kinds for entries with wrong values, AssertionError among them
+    except Exception as error:  # Optuna raises many kinds of errors for wrong values, such as AssertionError
         raise _corrupt(file, error) from None
 
 

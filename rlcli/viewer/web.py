@@ -67,7 +67,7 @@ def ssh_tunnel_command(port: int) -> str | None:
         return None
     try:
         user = getpass.getuser()
-    except (OSError, KeyError, ImportError):  # the user id has no name
+    except (OSError, KeyError, ImportError):  # the operating system has no name for this user id
         user = "USER"
     return f"ssh -N -L {port}:127.0.0.1:{port} {shlex.quote(f'{user}@{connection[2]}')}"
 

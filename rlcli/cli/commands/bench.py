@@ -261,8 +261,8 @@ class _View(LiveView):
         for row in findings.trained:
             setting, ms = row.setting, cell(row.milliseconds, ".4g", " ms")
             steps = [] if setting.horizon is None else [f"{setting.horizon} steps"]
-            threads = f"threads {setting.engine_threads}, {setting.torch_threads}, workers {setting.workers}"
-            rows.append([f"{setting.num_envs:,} envs", *steps, threads, ms])
+            threads = f"engine threads {setting.engine_threads}, torch threads {setting.torch_threads}"
+            rows.append([f"{setting.num_envs:,} envs", *steps, f"{threads}, workers {setting.workers}", ms])
         if self._live is None and len(rows) > len(self._rows):
             console.info("  ".join(rows[-1]))
         self._rows = rows

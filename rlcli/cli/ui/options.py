@@ -242,7 +242,7 @@ def budget_keys(
 
 
 def video_file(video: Path | None, default: str) -> Path | None:
-    """Return the file of --video, the default one if the option has no value; check that it can be written."""
+    """Return the file that --video names, or `default` if it names none; check that the file can be written."""
     if video is None:
         return None
     from rlcli.runs.atomic_io import require_writable

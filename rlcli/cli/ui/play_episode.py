@@ -45,7 +45,7 @@ def check_choice(
             hint=f"give --num-envs {env + 1}, or leave it out",
         )
     if record_mode != "all":
-        raise UsageError("--env and --episode choose one episode, --record-mode chooses among several: leave it out")
+        raise UsageError("--env and --episode choose one episode; leave out --record-mode, which chooses several")
     if commands:
         raise UsageError(
             "--command would change the episode that --env and --episode choose",

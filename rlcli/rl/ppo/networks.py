@@ -221,7 +221,7 @@ def _activation(name: str) -> nn.Module:
 
 
 def _initialize(layer: nn.Linear | nn.Conv2d, init: str, gain: float) -> nn.Module:
-    """Set the initial weights for the `init` settings other than torch's default; return the layer."""
+    """Set the initial weights that the setting `init` demands (`default`: torch's); return the layer."""
     if init == "orthogonal":
         nn.init.orthogonal_(layer.weight, gain)
     if init != "default":

@@ -87,7 +87,8 @@ class PpoTrainer(BaseTrainer):
         self.keep_recent_obs(self.collector.obs["policy"])
         collected = self._timestamp()
         torch.set_num_threads(self.learner.torch_threads)
-        self.learner.decay_learning_rate(remaining_budget(self.config, self))  # before the iteration is counted
+        # before the iteration is counted, so that the first one has the whole learning rate
+        self.learner.decay_learning_rate(remaining_budget(self.config, self))
         self.collector.iteration += 1
         self.env_steps += self.steps_per_iteration
         self._update()

@@ -358,7 +358,7 @@ def test_robot_without_keyframe_has_a_warning_and_a_true_readme(cli, tmp_path):
 def test_robot_with_keyframe_has_no_warning(cli, tmp_path):
     result, _ = written(cli, tmp_path, CART.replace("<worldbody>", '<compiler settotalmass="3"/><worldbody>'))
     assert "warning" not in result.err  # MuJoCo's deprecation of an attribute is none for the user
-    assert "is the first keyframe" in (tmp_path / "my-robot" / "README.md").read_text()
+    assert "is a keyframe of the" in (tmp_path / "my-robot" / "README.md").read_text()
 
 
 def test_camera_is_as_far_away_as_the_robot_is_large(cli, tmp_path):
