@@ -1,4 +1,4 @@
-"""`configclass`: a dataclass that also takes members without annotations, and copies defaults for every object."""
+"""`configclass`, a decorator for dataclasses: members need no annotations, and each object gets copies of defaults."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def configclass(cls: type[T]) -> type[T]:
     """Turn a class into a dataclass: all names except methods and nested classes become fields."""
     own = inspect.get_annotations(cls)
     assigned = [name for name, value in vars(cls).items() if name in own or _is_setting(cls, name, value)]
-    if hasattr(cls, "__settings__"):  # a subclass of a class that takes any settings (sim.py)
+    if hasattr(cls, "__settings__"):  # a subclass of a class that accepts settings of any name (sim.py)
         cls._fixed = {**cls._fixed, **{name: vars(cls)[name] for name in assigned}}  # type: ignore[attr-defined]
         return cls
     names = [*(name for name in own if name not in assigned), *assigned]
@@ -52,7 +52,7 @@ def config_subclass(class_type: str, doc: str, base: type, **members: Any) -> An
 
 
 def is_missing(value: Any) -> bool:
-    """Return whether a value is MISSING or a copy of it, so that the user must set it."""
+    """Return whether a value is MISSING or a copy of MISSING, which means that the user must set it."""
     return isinstance(value, type(MISSING))
 
 

@@ -1,4 +1,7 @@
-"""Configuration classes of observation noise. Names as in `isaaclab.utils.noise`."""
+"""Configuration classes of observation noise.
+
+A task of Isaac Lab that imports a name from `isaaclab.utils.noise` gets the object of this name from here.
+"""
 
 from __future__ import annotations
 
