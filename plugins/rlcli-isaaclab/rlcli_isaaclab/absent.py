@@ -64,7 +64,7 @@ def reason_of(name: str) -> tuple[str, str]:
 def absence(name: str, hint: str | None = None) -> TaskError:
     """Return the error for using a name of Isaac Lab or Isaac Sim that rlcli does not have.
 
-    `hint` replaces the usual hint, that of `reason_of`.
+    `hint` replaces the hint that `reason_of` returns.
     """
     reason, usual = reason_of(name)
     return TaskError(f"{user_place()}{name} cannot be used: {reason}", hint=hint or usual)
@@ -104,7 +104,7 @@ class _AbsentMeta(type):
         return AbsentValue(f"{type.__getattribute__(cls, '__doc__')}.{name}")
 
     def __call__(cls, *args: Any, **settings: Any) -> Any:
-        if "absent_name" not in vars(cls):  # a class of the user, derived from a replaced class
+        if "absent_name" not in vars(cls):  # a class of the task that derives from a replaced class
             raise absence(str(getattr(cls, "absent_name", cls.__name__)))
         return AbsentValue(str(cls.__doc__))
 
@@ -208,7 +208,7 @@ def absent_function(name: str) -> AbsentValue:
 
 
 class _NoSettings:
-    """Replacement for the settings of Isaac Sim's application; all are unset."""
+    """Replacement for the settings of Isaac Sim's application, in which every setting is unset."""
 
     def get(self, name: str) -> None:
         """Return None."""
@@ -221,7 +221,7 @@ class _NoSettings:
 
 
 class NoEffect:
-    """Replacement for a USD prim that only changes how a scene looks, or for a part of a prim: calls do nothing."""
+    """Replacement for a USD prim, or a part of a prim, that only changes how a scene looks: calls do nothing."""
 
     def __init__(self, name: str) -> None:
         self._name = name

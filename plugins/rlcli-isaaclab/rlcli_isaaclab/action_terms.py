@@ -100,7 +100,7 @@ class JointPositionAction(JointAction):
 
 
 class RelativeJointPositionAction(JointAction):
-    """Position targets relative to the joint positions of each physics step [m or rad]."""
+    """Action whose columns are added to the joint positions at each physics step, as position targets [m or rad]."""
 
     def __init__(self, cfg: Any, env: Any) -> None:
         super().__init__(cfg, env)
@@ -135,7 +135,7 @@ class JointEffortAction(JointAction):
 
 
 class ThrustAction(AffineActionTerm):
-    """Thrusts of the rotors of a `Multirotor` [N]."""
+    """Action whose columns are thrusts of the rotors of a `Multirotor` [N]."""
 
     def __init__(self, cfg: Any, env: Any) -> None:
         asset = env.scene[cfg.asset_name]
@@ -163,7 +163,7 @@ rlcli's built-in actions act only once per environment step.
 def find_action(class_type: Any) -> type[ActionTerm] | None:
     """Return the class that runs an action: the user's own or one of this package; None: a built-in action of rlcli.
 
-    `class_type` is the action's `class_type` in its configuration.
+    `class_type` is the setting of this name in the configuration of the action.
     """
     name = class_type.rpartition(":")[2].rpartition(".")[2] if isinstance(class_type, str) else ""
     if name in _LAB_ACTIONS:
@@ -177,7 +177,7 @@ def find_action(class_type: Any) -> type[ActionTerm] | None:
 def driven_by(action: type[ActionTerm] | None) -> str | None:
     """Return the kind of commands that an action class sends to joints, by its source code.
 
-    It is motor for efforts, velocity for velocities; None: neither.
+    The kind is `motor` for efforts, `velocity` for velocities, and None for all other commands.
     """
     if action is None:
         return None

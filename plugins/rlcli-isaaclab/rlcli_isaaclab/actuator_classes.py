@@ -1,4 +1,7 @@
-"""Actuator models that compute joint efforts; a task may subclass them. Names as in `isaaclab.actuators`."""
+"""Actuator models that compute joint efforts; a task may subclass them.
+
+A task of Isaac Lab that imports a name from `isaaclab.actuators` gets the object of this name from here.
+"""
 
 from __future__ import annotations
 
@@ -86,7 +89,7 @@ _DEFAULTS = {
 
 
 class IdealPDActuator(ActuatorBase):
-    """A PD controller with a limit of the effort."""
+    """PD controller with a limit on the effort."""
 
     def compute(self, control_action: ArticulationActions, joint_pos: Tensor, joint_vel: Tensor) -> ArticulationActions:
         """Return the efforts of the controller."""
@@ -100,9 +103,10 @@ class IdealPDActuator(ActuatorBase):
 
 
 class ImplicitActuator(IdealPDActuator):
-    """A PD controller for subclasses of Isaac Lab's implicit actuator, whose drive PhysX integrates.
+    """PD controller, the base class of a task's subclasses of Isaac Lab's implicit actuator.
 
-    The subclass changes the targets in `compute`; rlcli computes the effort before each physics step.
+    In Isaac Lab PhysX integrates this drive. Here the subclass may change the targets in `compute`, and rlcli computes
+    the effort before each physics step.
     """
 
     is_implicit_model = True

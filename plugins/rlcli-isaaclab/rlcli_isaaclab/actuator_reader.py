@@ -35,7 +35,8 @@ def read_actuators(
 
     Args:
         actuators: the groups of actuators, `actuators` of an `ArticulationCfg`.
-        order_joints: function that returns the names or regular expressions of a group's joints in the model's order.
+        order_joints: function that sorts the joints of a group (names or regular expressions) into the order of the
+            model.
         joint_names: the joints of the entity's model.
         entity: name of the entity, for messages.
         replaced: group -> gains of the PD controller that replaces its actuator network.
@@ -114,7 +115,7 @@ _NO_SPEED_LIMIT = "terms read it; MuJoCo's joints have no speed limit"
 def _read_implicit_limits(item: Node) -> dict[str, Any]:
     """Return `effort_limit` and `velocity_limit` of an implicit actuator.
 
-    As in Isaac Lab, only `velocity_limit_sim` sets the latter; `velocity_limit` alone has no effect.
+    As in Isaac Lab, only `velocity_limit_sim` sets the velocity limit; `velocity_limit` alone has no effect.
     """
     for key in ("effort_limit", "velocity_limit"):
         old, new = item.get(key), item.get(f"{key}_sim")
@@ -192,7 +193,7 @@ def add_joint_settings(
 def _merge(
     settings: JointSettings, model: Mapping[str, Any], driven: Mapping[str, str], name: str, report: Report
 ) -> dict[str, Any]:
-    """Return the content of the key `joints` of an entity in rlcli's scene, without values that its MJCF already has.
+    """Return the key `joints` of an entity in rlcli's scene, without values that its MJCF already has.
 
     Args:
         settings: settings of the joints, from `read_actuators`.
@@ -229,7 +230,7 @@ def _merge(
 
 
 def _passive_joints(settings: JointSettings, model: Mapping[str, Any], driven: Mapping[str, str]) -> list[str]:
-    """Return the joints whose position an action commands without effect, because their drive has no stiffness.
+    """Return the joints whose position action has no effect, because their drive has no stiffness.
 
     If no joint has a drive, the list is empty: then the actions are a mistake, which the environment reports.
     """

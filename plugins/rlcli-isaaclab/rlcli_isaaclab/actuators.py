@@ -1,4 +1,7 @@
-"""Configuration classes of actuators. Names as in `isaaclab.actuators`."""
+"""Configuration classes of actuators.
+
+A task of Isaac Lab that imports a name from `isaaclab.actuators` gets the object of this name from here.
+"""
 
 from __future__ import annotations
 

@@ -60,7 +60,7 @@ def _text(note: Note) -> tuple[Any, ...]:
 
 
 def _numbers(value: Any) -> Any:
-    """Return data with numbers in place of strings such as `1e-4`, which PyYAML does not read as numbers."""
+    """Return data in which strings such as `1e-4`, which PyYAML does not read as numbers, are numbers."""
     if isinstance(value, dict):
         return {str(key): _numbers(item) for key, item in value.items()}
     if isinstance(value, list):

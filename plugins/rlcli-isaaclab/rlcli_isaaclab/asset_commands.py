@@ -246,9 +246,9 @@ class PhysxView:
         return limits.expand(self._env.num_envs, *limits.shape[-2:]).clone()
 
     def get_jacobians(self) -> Tensor:
-        """Return the Jacobians of the bodies' origins, world frame: without the first body, which is fixed.
+        """Return the Jacobians of the origins of all bodies but the first one, which is fixed, world frame.
 
-        (num_envs, bodies - 1, 6, joints), linear before angular
+        (num_envs, bodies - 1, 6, joints); of the six rows the first three are linear, the others angular
         """
         if self._entity.is_floating:
             raise TaskError(

@@ -37,8 +37,8 @@ _DATA_NAMES = {
     "body_com_ang_acc_w": "body_ang_acc_w",
     "body_incoming_joint_wrench_b": "body_incoming_wrench_b",
 }
-"""Isaac Lab's name -> rlcli's name, where they differ. Isaac Lab's velocities without `link` are those of the centre of
-mass, whatever the entity's `velocity_point` is."""
+"""Isaac Lab's name -> rlcli's name, where they differ. In Isaac Lab, a velocity without `link` in its name is that of
+the centre of mass; the entity's `velocity_point` does not change this."""
 
 
 _MOST_VELOCITY = math.radians(1e6)
@@ -56,7 +56,7 @@ class Data:
 
     @property
     def _data(self) -> EntityData:
-        """State of the entity, updated if a physics step has run since it was computed."""
+        """State of the entity. It is computed again if a physics step has run since the last time."""
         update_state(self._env)
         return self._entity.data
 
@@ -71,7 +71,7 @@ class Data:
             raise AttributeError(f"asset.data has no '{name}'; {hint}") from None
 
     def _gains(self, column: int) -> Tensor:
-        """Return stiffness (column 1) or damping (2) of the joints, as the model and the actuators have it."""
+        """Return stiffness (column 1) or damping (column 2) of the joints, from the model and the actuator models."""
         model, entity = self._env.engine.model, self._entity
         found = torch.zeros(self._env.num_envs, len(self.joint_names), device=self._env.device)
         if column == 2:

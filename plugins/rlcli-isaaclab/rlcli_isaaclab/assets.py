@@ -1,6 +1,6 @@
 """Configuration classes of robots and objects.
 
-Names as in `isaaclab.assets` and `isaaclab_assets`.
+A task of Isaac Lab that imports a name from `isaaclab.assets` or `isaaclab_assets` gets the object from here.
 """
 
 from __future__ import annotations

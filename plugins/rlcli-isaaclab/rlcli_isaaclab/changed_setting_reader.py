@@ -42,7 +42,7 @@ def read_changed_setting(reader: TermReader, function: type, node: Node, params:
 def _translate_again(
     reader: TermReader, section: str, term: list[str], settings: Mapping[str, Any]
 ) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Translate one term of Isaac Lab again, with changed settings.
+    """Translate one term of Isaac Lab with changed settings, to find out which settings of rlcli change.
 
     Args:
         reader: reader of the task's terms; it is not changed.

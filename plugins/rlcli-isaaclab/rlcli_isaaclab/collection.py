@@ -66,9 +66,9 @@ class RigidObjectCollection:
     )  # fmt: skip
 
     def _each(self, values: Tensor, object_ids: Any) -> list[tuple[Asset, Tensor]]:
-        """Return (object, values of the object) for each object of `object_ids`; None: all objects.
+        """Return (object, its values) for each object of `object_ids`; None: all objects.
 
-        `values` is (rows, objects, ...); without the first dimension, they are for all environments.
+        `values` has the shape (rows, objects, ...). Without the first dimension, the values apply to all environments.
         """
         values = values if values.dim() == 3 else values[None]
         ids = list(range(self.num_objects))

@@ -1,6 +1,6 @@
 """Command classes with Isaac Lab's interface, for the user's subclasses and for terms that read their attributes.
 
-Otherwise a command of Isaac Lab is replaced by rlcli's built-in command.
+Where a task has no subclass and its terms do not read such attributes, rlcli's built-in command replaces the class.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""`configclass`: a dataclass that also takes members without annotations, and copies defaults for every object."""
+"""`configclass`, a decorator for dataclasses: members need no annotations, and each object gets copies of defaults."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ T = TypeVar("T")
 def configclass(cls: type[T]) -> type[T]:
     """Turn a class into a dataclass: all names except methods and nested classes become fields."""
     own = inspect.get_annotations(cls)
+<<<<<<< HEAD
     inherited = {name for base in cls.__mro__[1:] for name in getattr(base, "__dataclass_fields__", ())}
     assigned = [
         name
@@ -25,6 +26,10 @@ def configclass(cls: type[T]) -> type[T]:
         if name in own or _is_setting(cls, name, value) or (name in inherited and inspect.isfunction(value))
     ]
     if hasattr(cls, "__settings__"):  # a subclass of a class that takes any settings (sim.py)
+=======
+    assigned = [name for name, value in vars(cls).items() if name in own or _is_setting(cls, name, value)]
+    if hasattr(cls, "__settings__"):  # a subclass of a class that accepts settings of any name (sim.py)
+>>>>>>> voice2
         cls._fixed = {**cls._fixed, **{name: vars(cls)[name] for name in assigned}}  # type: ignore[attr-defined]
         return cls
     names = [*(name for name in own if name not in assigned), *assigned]
@@ -57,7 +62,7 @@ def config_subclass(class_type: str, doc: str, base: type, **members: Any) -> An
 
 
 def is_missing(value: Any) -> bool:
-    """Return whether a value is MISSING or a copy of it, so that the user must set it."""
+    """Return whether a value is MISSING or a copy of MISSING, which means that the user must set it."""
     return isinstance(value, type(MISSING))
 
 

@@ -1,4 +1,7 @@
-"""Configuration of differential inverse kinematics; a replacement for Pink's. Names as in `isaaclab.controllers`."""
+"""Configuration of differential inverse kinematics, and a stand-in for a function of Pink (another IK library).
+
+A task of Isaac Lab that imports a name from `isaaclab.controllers` gets the object of this name from here.
+"""
 
 from __future__ import annotations
 
@@ -110,7 +113,7 @@ _DEFAULTS = {
 
 
 def convert_usd_to_urdf(usd_path: str, output_path: str, force_conversion: bool = True) -> tuple[str, str]:
-    """Return the paths that Isaac Lab would write, and write nothing: only Pink reads them, which rlcli refuses."""
+    """Return the paths that Isaac Lab would write, without writing: only Pink, which rlcli lacks, reads the files."""
     return f"{output_path}/urdf", f"{output_path}/meshes"
 
 

@@ -199,9 +199,9 @@ def agent(data: Mapping[str, Any], report: Report) -> dict[str, Any]:
 
 
 def _policy(top: Node) -> Node:
-    """Return the settings of actor and critic with the keys of `policy`.
+    """Return the settings of actor and critic, with the keys of the setting `policy` of RSL-RL before version 5.
 
-    RSL-RL 5 has the keys `actor` and `critic` instead of `policy`; they are translated.
+    RSL-RL 5 has the settings `actor` and `critic` instead, whose keys are translated.
     """
     if "policy" in top or "actor" not in top:
         return top.node("policy")

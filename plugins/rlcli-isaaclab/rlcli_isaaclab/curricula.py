@@ -1,4 +1,7 @@
-"""Curriculum terms that change the setting at an address in the configuration. Names as in `isaaclab.envs.mdp`."""
+"""Curriculum terms that change the setting at an address in the configuration.
+
+A task of Isaac Lab that imports a name from `isaaclab.envs.mdp` gets the object of this name from here.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +30,7 @@ class modify_env_param(ManagerTermBase):  # noqa: N801  (Isaac Lab's name)
         self._value = torch.tensor(self._setting.start, dtype=torch.float64)
 
     def __call__(self, env: Any, env_ids: Any, modify_fn: Any, modify_params: Any = None, **opened: Tensor) -> None:
-        """Change the setting; `opened` has the tensors of rlcli's settings that depend on it, written in place."""
+        """Change the setting; `opened` has the tensors of rlcli's settings that depend on it, changed in place."""
         value = _in_form_of(self._setting.start, self._value.tolist())
         new = modify_fn(env, env_ids, value, **(modify_params or {}))
         if new is self.NO_CHANGE:
@@ -75,7 +78,7 @@ class ChangedSetting:
         if not _is_number(self.start):
             raise KeyError(address)
         self.is_own = False
-        """Whether the term runs the user's own code, which receives the value itself."""
+        """Whether the term runs the task's own code, which receives Isaac Lab's value instead of a translated one."""
         changed = set(self._numbers(_moved(self.start)).items()) - set(self._numbers(self.start).items())
         names = sorted(name for name, _ in changed)
         self.addresses = [(f"address_{index}", name) for index, name in enumerate(names)]
@@ -133,7 +136,8 @@ def _is_number(value: Any) -> bool:
 def _moved(value: Any) -> Any:
     """Return a setting with 1 added to each of its numbers.
 
-    Settings of rlcli that differ after a translation of the changed value depend on this setting.
+    The class translates the term with the original and with this value: settings of rlcli that then differ depend on
+    the setting.
     """
     if isinstance(value, list | tuple):
         return type(value)(_moved(item) for item in value)

@@ -1,4 +1,6 @@
-"""`DirectRLEnv`: direct tasks of Isaac Lab. Names as in `isaaclab.envs`.
+"""`DirectRLEnv`: direct tasks of Isaac Lab.
+
+A task of Isaac Lab that imports a name from `isaaclab.envs` gets the object of this name from here.
 
 rlcli runs a direct task as a manager-based one with one action, one reward and so on, which call the hooks of the task
 (`direct_terms.py`).
@@ -28,7 +30,7 @@ from rlcli_isaaclab.sim import SimulationCfg
 from rlcli_isaaclab.user_files import placed
 
 MANAGED: ContextVar[Any] = ContextVar("managed")
-"""The environment of rlcli that is creating an object of the task's class."""
+"""Environment of rlcli that is now creating an object of the task's class."""
 
 
 @contextlib.contextmanager
@@ -185,11 +187,11 @@ class DirectRLEnv(gymnasium.Env):
         raise NotImplementedError(f"class {type(self).__name__} has no method _get_rewards; implement it")
 
     def _get_dones(self) -> tuple[Tensor, Tensor]:
-        """Return where the task ended the episode, and where it timed out. (num_envs,) bool each"""
+        """Return where the task terminated the episode, and where the episode timed out. (num_envs,) bool each"""
         raise NotImplementedError(f"class {type(self).__name__} has no method _get_dones; implement it")
 
     def _reset_idx(self, env_ids: Any) -> None:
-        """Remove forces on bodies. The environment resets everything else, and runs the reset events."""
+        """Remove the forces on bodies. rlcli's environment resets everything else, and runs the reset events."""
         for asset in self.scene.articulations.values():
             asset.reset(env_ids)
 
@@ -198,7 +200,7 @@ class DirectRLEnv(gymnasium.Env):
 
 
 def _refuse_step(*args: Any, **options: Any) -> None:
-    """Raise TaskError: a task steps the simulation itself, for example in a reset."""
+    """Raise a TaskError, because a task may not step the simulation itself, for example in a reset."""
     what = f"{user_place()}env.sim.step cannot be used: a task cannot step the simulation itself"
     raise TaskError(what, hint="rlcli steps all environments at once; set joint positions in a reset instead")
 
@@ -318,7 +320,7 @@ class _Recorded(BaseException):
 
 
 class _Shell:
-    """Replacement for the environment of rlcli, with the values that `_setup_scene` may read before it exists."""
+    """Stand-in for the environment of rlcli before it exists, with the values that `_setup_scene` may read."""
 
     def __init__(self, cfg: Any) -> None:
         self.device, self.num_envs = "cpu", cfg.scene.num_envs

@@ -38,7 +38,7 @@ class HookTerm:
         return self
 
     def __call__(self, *args: Any) -> Any:
-        """Raise an error: only the copy that the environment makes of the term can be called."""
+        """Raise an error: this object only describes the term; the environment makes another one, which it calls."""
         raise TypeError(f"the term {self.hook} cannot be called before it is bound to an environment")
 
     def __rlcli_term__(self, name: str) -> Signature:
@@ -150,7 +150,7 @@ def _layout_of(shape: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def _in_layout(value: Tensor) -> Tensor:
-    """Return images (num_envs, h, w, c) with the channels first, and other tensors flattened."""
+    """Return an image (num_envs, h, w, c) with the channels first, and any other tensor as (num_envs, k)."""
     if value.dim() == 4:
         return value.movedim(-1, 1).contiguous()
     return value.flatten(1) if value.dim() > 2 else value

@@ -1,7 +1,7 @@
 """Reader of the YAML that Isaac Lab writes and reads, with the limits of rlcli's own YAML.
 
-In contrast to rlcli's own YAML it may have anchors and the tags of Python objects: PyYAML writes tuples and slices with
-tags, and a value that several settings share with an anchor. No Python object is constructed.
+In contrast to rlcli's own YAML, these files may have anchors and tags of Python objects: PyYAML writes tuples and
+slices with tags, and uses an anchor for a value that several settings share. The reader constructs no Python objects.
 """
 
 from __future__ import annotations
@@ -67,12 +67,12 @@ class _Loader(strict_yaml.Loader):
         super().__init__(text)
         self._items = self._depth = 0
         self._deepest = 0
-        """Depth of the deepest value since the beginning of the value that is composed now."""
+        """Depth [levels] of the deepest value since the beginning of the value that is read now."""
         self._extents: dict[str, tuple[int, int]] = {}
         """Anchor of a complete value -> its number of values, and its height in levels."""
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        """Compose a value. Values that aliases repeat count each time, so that a small file cannot become huge."""
+        """Read a value. Values that aliases repeat count each time, so that a small file cannot become huge."""
         event = self.peek_event()
         anchor, mark = event.anchor, event.start_mark
         if isinstance(event, yaml.AliasEvent):
@@ -110,7 +110,7 @@ class _Loader(strict_yaml.Loader):
             raise _error(message, event.start_mark)
 
     def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
-        """Return the value of a node; a scalar that Python cannot hold is an error with its position."""
+        """Return the value of a node of the YAML; a scalar that Python cannot hold is an error with its position."""
         try:
             return super().construct_object(node, deep)
         except (ValueError, OverflowError, TypeError) as error:

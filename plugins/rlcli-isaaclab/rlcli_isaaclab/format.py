@@ -1,4 +1,4 @@
-"""Declaration of the format `isaaclab`: how rlcli recognizes a folder with a task of Isaac Lab."""
+"""Entry point of the plugin (`rlcli.formats`): how rlcli recognises and reads tasks of Isaac Lab."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ LIBRARIES = {
     **{"hydra": "hydra-core", "omegaconf": "omegaconf", "wandb": "wandb", "tensorboard": "tensorboard"},
     **{"hid": "hidapi", "sklearn": "scikit-learn", "cv2": "opencv-python", "PIL": "pillow", "warp": "warp-lang"},
 }
-"""Library that is installed with Isaac Lab -> its name for pip. If a library is missing, its use raises an error."""
+"""Library that Isaac Lab installs -> its name for pip. If a library is missing, an error is raised when it is used."""
 _FRAMEWORK = (
     *("isaaclab", "isaaclab_tasks", "isaaclab_assets", "isaaclab_rl", "isaaclab_contrib", "isaaclab_mimic"),
     *("isaacsim", "omni", "pxr", "carb", "usdrt"),
 )
 TRAINERS = ("rsl_rl",)
-"""Libraries of agents, of which repositories often need an own version. A name that the installed one lacks, or every
-name without the library, raises an error when it is used."""
+"""Libraries of agents, of which task repositories often need a certain version. If the library or a name in it is
+missing, an error is raised only when the name is used."""
 _LIBRARIES = ("toml", "pink", "pinocchio", "trimesh", *TRAINERS, *LIBRARIES)
 FOREIGN = (*_FRAMEWORK, *_LIBRARIES)
 """Packages whose modules `namespace.py` replaces in task files."""

@@ -84,7 +84,7 @@ def _write(folder: Path, data: dict[str, Any], report: Report) -> list[str]:
 
 
 def _compiles_alone(model: Path, folder: Path) -> bool:
-    """Copy an MJCF into a folder, and return whether it compiles there; if not (it needs meshes), remove the copy."""
+    """Copy an MJCF into a folder, and return whether it compiles there; if it does not (lacking meshes), remove it."""
     from rlcli.scene.untrusted_mjcf import read_mjcf
 
     copy = folder / model.name

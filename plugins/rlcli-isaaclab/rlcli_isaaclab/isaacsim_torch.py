@@ -37,7 +37,7 @@ def normalize_angle(x: Tensor) -> Tensor:
 
 
 def tf_combine(q1: Tensor, t1: Tensor, q2: Tensor, t2: Tensor) -> tuple[Tensor, Tensor]:
-    """Combine two poses: return the pose (q2, t2), given in the frame (q1, t1), in the parent frame of (q1, t1)."""
+    """Return a pose (q2, t2), which is relative to the frame (q1, t1), in the parent frame of that frame."""
     return quat_mul(q1, q2), quat_apply(q1, t2) + t1
 
 
@@ -48,7 +48,7 @@ def tf_inverse(q: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def tf_apply(q: Tensor, t: Tensor, v: Tensor) -> Tensor:
-    """Return the point v rotated by q and moved by t. (..., 4), (..., 3), (..., 3) -> (..., 3)"""
+    """Return the point v, rotated by the quaternion q and moved by t. (..., 4), (..., 3), (..., 3) -> (..., 3)"""
     return quat_apply(q, v) + t
 
 

@@ -1,4 +1,4 @@
-"""Terms of Isaac Lab, written again in its form, because no built-in term of rlcli has their parameters."""
+"""Reimplementations of Isaac Lab's terms, in Isaac Lab's form, whose parameters no built-in term of rlcli has."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class LabTerm:
 
     function: Any
     needed: Callable[[Mapping[str, Any]], bool]
-    """Function from the term's parameters to whether they need `function`, not the built-in term of the same name."""
+    """Function of the term's parameters that returns whether they need `function` instead of the built-in term."""
 
 
 def last_action_of_term(env: Any, action_name: str) -> Tensor:

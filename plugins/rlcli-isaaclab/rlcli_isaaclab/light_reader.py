@@ -11,7 +11,7 @@ def read_light(report: Report, item: Node, spawn: Node, lights: dict[str, Any]) 
     """Add a dome or distant light of Isaac Lab to `lights`, the lights of the task by kind; report other lights.
 
     Args:
-        report: report of the settings that are read.
+        report: receives how each setting was translated.
         item: settings of the light in the scene.
         spawn: settings of its `spawn`.
         lights: kind of light -> settings in the task; the light is added here.

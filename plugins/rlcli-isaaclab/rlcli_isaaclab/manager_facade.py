@@ -17,7 +17,7 @@ from rlcli_isaaclab.absent import absence, user_place
 
 
 class ManagerFacade:
-    """A manager of rlcli with the attributes of Isaac Lab's."""
+    """Base class of the adapters: a manager of rlcli with the attributes of Isaac Lab's managers."""
 
     def __init__(self, manager: Any) -> None:
         self._manager = manager
@@ -34,7 +34,7 @@ class ManagerFacade:
 
     @property
     def cfg(self) -> Any:
-        """Terms by name: `func` is the function or the user's object, `params` are the parameters."""
+        """Settings of the terms by name: `func` is the function or the user's object, `params` has the parameters."""
         return SimpleNamespace(
             **{
                 term.name: SimpleNamespace(
@@ -106,7 +106,7 @@ class TerminationManagerFacade(ManagerFacade):
 
     @property
     def dones(self) -> Tensor:
-        """Terminated or timed out in this step. (num_envs,) bool"""
+        """Where the episode ended in this step, by a termination or by time-out. (num_envs,) bool"""
         return self._manager.terminated | self._manager.time_outs
 
     def get_term(self, name: str) -> Tensor:
@@ -173,7 +173,7 @@ class RewardManagerFacade(ManagerFacade):
 
 
 class RewardSettings:
-    """Settings of a reward. Only the weight can change, and only in a curriculum term."""
+    """Settings of a reward term. Only the weight can be changed, and only by a curriculum term."""
 
     def __init__(self, config: Any, tunable: Any, path: tuple[Any, ...]) -> None:
         self._config, self._tunable, self._path = config, tunable, path

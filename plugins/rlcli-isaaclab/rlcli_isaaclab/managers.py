@@ -1,4 +1,7 @@
-"""Configuration classes of terms, and base classes for the user's own terms. Names as in `isaaclab.managers`."""
+"""Configuration classes of terms, and base classes for the user's own terms.
+
+A task of Isaac Lab that imports a name from `isaaclab.managers` gets the object of this name from here.
+"""
 
 from __future__ import annotations
 

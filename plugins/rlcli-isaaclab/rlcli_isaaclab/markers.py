@@ -1,4 +1,7 @@
-"""Replacement for markers that a task creates, which rlcli does not draw. Names as in `isaaclab.markers`."""
+"""Replacement for markers that a task creates, which rlcli does not draw.
+
+A task of Isaac Lab that imports a name from `isaaclab.markers` gets the object of this name from here.
+"""
 
 from __future__ import annotations
 

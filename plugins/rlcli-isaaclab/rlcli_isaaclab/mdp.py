@@ -1,7 +1,7 @@
 """Terms and actions under Isaac Lab's names: every term of `rlcli.mdp` that has a counterpart there.
 
-In a configuration such a function selects the built-in term. Called from the user's own term, it returns the value of
-the built-in term: `mdp.joint_pos_rel(env, asset_cfg)`.
+In a configuration such a function stands for the built-in term. The user's own terms may also call it:
+`mdp.joint_pos_rel(env, asset_cfg)` returns the value of the built-in term.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ def _elements(
 
 
 class SensorPart:
-    """View of some bodies of a contact sensor."""
+    """Contact sensor reduced to some of its bodies."""
 
     def __init__(self, whole: Any, ids: Any) -> None:
         self._whole, self._ids = whole, ids
@@ -176,7 +176,7 @@ def __getattr__(name: str) -> Any:
 
 
 class _UnknownTermError(AttributeError):
-    """Error for a name that this module lacks; similar names are searched, which is slow, only if it is printed."""
+    """Error for a name that this module lacks. The slow search for similar names runs only if the error is printed."""
 
     def __str__(self) -> str:
         near = did_you_mean(self.args[0], _names()) or "docs/reference/isaac-lab-terms.md lists the terms"

@@ -96,10 +96,10 @@ def model_hint(entity: str) -> str:
 
 
 def mjcf_of(usd: str, root: Path, given: Mapping[str, str], entity: str) -> str:
-    """Return the MJCF of an entity: the given one, else the path itself if it is an `.xml` file, else a known one.
+    """Return the MJCF of an entity: the one that the user gives, else `usd` if it is an `.xml` file, else a known one.
 
     Args:
-        usd: the path of the model in the task's files.
+        usd: path of the model in the task's files, usually of a USD file.
         root: the folder of the task, which is searched for `NAME.xml`.
         given: the entity's name, or the end of a model's path -> the MJCF that the user gives for it.
         entity: the entity's name.

@@ -1,4 +1,7 @@
-"""Flying robots that thrusters drive. Names as in `isaaclab_contrib`."""
+"""Flying robots that thrusters drive.
+
+A task of Isaac Lab that imports a name from `isaaclab_contrib` gets the object of this name from here.
+"""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Replacement of the modules `isaaclab` and `isaacsim` that task files import.
 
-The table `names.json` lists the public names of each module of Isaac Lab; `tools/names.py` writes it. A name that this
-package defines is imported from this package. For any other name of the table a task gets a replacement, which raises
-an error when the task uses it.
+The file `names.json` lists the public names of each module of Isaac Lab; `tools/names.py` writes it. If this package
+defines a name, the task gets that object. For any other name in the list the task gets a replacement, which raises an
+error when the task uses it.
 """
 
 from __future__ import annotations
@@ -71,14 +71,14 @@ _STAR_NAMES = {
         *("quat_from_euler_xyz", "quat_unique", "wrap_to_pi", "yaw_quat", "generic_io_descriptor", "Sequence"),
     )
 }
-"""Module -> names that its files import, and that `from MODULE import *` imports as well."""
+"""Module -> names that the files of the module import themselves, so that `from MODULE import *` has them, too."""
 _LIBRARY_NAMES = {
     **{"math_utils": "isaaclab.utils.math", "string_utils": "isaaclab.utils.string", "sim_utils": "isaaclab.sim"},
     **{"math": "math", "re": "re", "torch": "torch", "Literal": "typing", "Sequence": "collections.abc"},
 }
 """Name in `_STAR_NAMES` -> the module with this name, or the module that defines the name."""
 _SOURCE_PACKAGES = ("isaaclab_tasks", "isaaclab_assets")
-"""Packages of which Isaac Lab's original files are imported, if found: their code only uses other modules."""
+"""Packages whose original files are imported if they are found, because their code only uses other modules."""
 _TORCH = "isaacsim.core.utils.torch"
 _SIM = {
     **dict.fromkeys((_TORCH, *(f"{_TORCH}.{n}" for n in ("rotations", "maths", "transformations"))), "isaacsim_torch"),
@@ -231,7 +231,7 @@ def _member(module: str, name: str) -> Any:
 
 
 class _UnknownNameError(AttributeError):
-    """Error for a name that Isaac Lab lacks; similar names are searched, which is slow, only if it is printed."""
+    """Error for a name that Isaac Lab lacks. The slow search for similar names runs only if the error is printed."""
 
     def __str__(self) -> str:
         name, module = self.args
@@ -241,7 +241,7 @@ class _UnknownNameError(AttributeError):
 
 @functools.cache
 def lab_name(name: str) -> Any:
-    """Return the object of a public name of Isaac Lab, wherever it is defined."""
+    """Return the object for a public name of Isaac Lab, from whichever module defines the name."""
     from rlcli_isaaclab import vocabulary
 
     if hasattr(vocabulary, name):
@@ -270,7 +270,7 @@ def _settings_class(name: str, kind: Mapping[str, Any], full: str, qualified: st
         members[inner] = _settings_class(inner, content, f"{full}.{inner}", f"{qualified}.{inner}")
     fields = dict(kind.get("fields", {}))
     known = {field for base in bases for field in getattr(base, "__dataclass_fields__", {})}
-    # null in the table: a value that JSON cannot store; the default of a base class is closer
+    # null in the table is a value that JSON cannot store; then the default of a base class is a better guess
     fields = {key: value for key, value in fields.items() if not (value is None and key in known)}
     if name.endswith("Cfg") and "class_type" not in fields and full.count(".") and not name[0].islower():
         fields.setdefault("class_type", name.removesuffix("Cfg"))

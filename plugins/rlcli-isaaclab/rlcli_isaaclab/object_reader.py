@@ -15,7 +15,8 @@ from rlcli_isaaclab.table import ACTIONS, ONCE_PER_STEP
 from rlcli_isaaclab.term_values import has_no_effect, is_plain
 
 OBJECT_KEYS = ("class_type", "resampling_time_range", "debug_vis")
-"""Settings of Isaac Lab's base configuration of actions and commands, which the user's class does not receive."""
+"""Settings that Isaac Lab's base classes of action and command configurations have; the user's class does not get
+them."""
 
 
 class ObjectReader:
@@ -112,7 +113,7 @@ class ObjectReader:
         return to_plain(value)
 
     def _read_user_object(self, class_type: type, node: Node) -> dict[str, Any]:
-        """Return the term of a class `Name(cfg, env)`: the user's, or one of this package."""
+        """Return the term for a class `Name(cfg, env)`, which is the user's or one of this package."""
         from rlcli_isaaclab.terms import UserObject, key_of
 
         section, name = node.key

@@ -1,4 +1,4 @@
-"""Noise models of direct tasks, which act on whole observations or actions."""
+"""Noise models of direct tasks: they add noise to all columns of the observations or actions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`obs_groups` of an RSL-RL runner: the observation groups that the actor and the critic read, in rlcli's form."""
+"""Translation of `obs_groups` of an RSL-RL runner, the observation groups that actor and critic read."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _RANDOM = ("noise", "bias", "delay")
 def fit_groups(
     sets: Mapping[str, Any], agent: dict[str, Any], observations: Mapping[str, Any], notes: list[Note]
 ) -> None:
-    """Set `critic_obs` of an agent, and the agent's changes of the task, so that it reads the groups of `obs_groups`.
+    """Change an agent (`critic_obs`, and its changes of the task) so that it reads the groups of `obs_groups`.
 
     rlcli's actor reads only the group `policy`. If `obs_groups` gives the actor other groups as well, their terms are
     added to `policy`.
@@ -44,7 +44,7 @@ def fit_groups(
 
 
 def _names(sets: Mapping[str, Any], observations: Mapping[str, Any], *keys: str) -> list[str]:
-    """Return the names of the groups in the set with the first of the `keys` that `sets` has; empty without one."""
+    """Return the group names under the first of the `keys` that `sets` has; an empty list if it has none of them."""
     key = next((key for key in keys if sets.get(key)), None)
     found = list(sets[key]) if key is not None else []
     # the group `actor` of a file is the group `policy` of rlcli

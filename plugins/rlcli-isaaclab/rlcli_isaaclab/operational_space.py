@@ -1,4 +1,4 @@
-"""Operational space control: joint efforts that move a body's frame to a pose, or press it with a wrench."""
+"""Operational space control: joint efforts that move a frame of a body to a pose, or push with a force and torque."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class OperationalSpaceController:
         self.desired_ee_wrench_b: Tensor | None = None
 
     def _row(self, value: Any) -> Tensor:
-        """Return one number, or six (one for each axis), as a row for each environment. (num_envs, 6)"""
+        """Return a setting (one number, or one for each axis) as a row for each environment. (num_envs, 6)"""
         row = torch.as_tensor(value, dtype=torch.float32, device=self._device).expand(6)
         return row.expand(self.num_envs, 6).clone()
 
@@ -143,7 +143,7 @@ class OperationalSpaceController:
             wrench = self.desired_ee_wrench_b
             if self._wrench_gain is not None:
                 force = _given(current_ee_force_b, "current_ee_force_b")
-                # only forces are measured: the torques stay an open loop
+                # only forces are measured, so the torques are controlled without feedback
                 missing = torch.cat([wrench[:, :3] - force, torch.zeros_like(force)], dim=1)
                 wrench = wrench + self._along_axes(self._wrench_gain, missing)
             wrench = self._along_axes(self._wrench_axes, wrench)
@@ -280,7 +280,8 @@ class OperationalSpaceControllerAction(ActionTerm):
         jacobian = view.get_jacobians()[:, self._body - 1][:, :, self._joint_ids]
         turn = matrix_from_quat(conjugate(root))
         moves, turns = turn @ jacobian[:, :3], turn @ jacobian[:, 3:]
-        # as in Isaac Lab, the offset acts on the Jacobian in the body's frame, and its rotation before the root's
+        # as in Isaac Lab, the offset is applied to the Jacobian in the body's frame, and the rotation of the offset
+        # before that of the root
         moves = moves - skew_symmetric_matrix(self._offset_pos) @ turns
         turns = matrix_from_quat(self._offset_rot) @ turns
         force = None

@@ -1,4 +1,7 @@
-"""Settings of RSL-RL, which the `ppo` trainer reads with `dialect: rsl_rl`. Names as in `isaaclab_rl.rsl_rl`."""
+"""Settings of RSL-RL, which the `ppo` trainer reads with `dialect: rsl_rl`.
+
+A task of Isaac Lab that imports a name from `isaaclab_rl.rsl_rl` gets the object of this name from here.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Isaac Lab's `ManagerBasedRLEnv` around an environment of rlcli: the `env` that the user's terms receive."""
+"""`ManagerBasedRLEnv`, an environment of rlcli with Isaac Lab's interface. The user's terms receive it as `env`."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class ManagerBasedRLEnv(gymnasium.Env):
         device = kwargs.get("device") or (cfg.sim.device if torch.cuda.is_available() else "cpu")
         resolved = resolve(source_of(cfg, Path(file).parent if file else None))
         managed = make_env(resolved, seed=42 if cfg.seed is None else cfg.seed, device=device)
-        self.__dict__ = facade_of(managed).__dict__  # terms receive the facade: share its attributes
+        self.__dict__ = facade_of(managed).__dict__  # terms receive the object of `facade_of`: share its attributes
         self.cfg = cfg
 
     @classmethod
@@ -279,7 +279,7 @@ def _own_class(entry: Any) -> type | None:
 
 _CREATED = "managers are created in the order commands, actions, terminations, rewards, observations, curriculum"
 OWN_CLASS = "isaaclab.envs:ManagerBasedRLEnv"
-"""Isaac Lab's environment class in a registration with Gymnasium."""
+"""Entry point of Isaac Lab's own environment class in a registration with Gymnasium."""
 
 
 def facade_of(managed: VecEnv) -> ManagerBasedRLEnv:

@@ -1,4 +1,7 @@
-"""Configuration class of the scene. Names as in `isaaclab.scene`."""
+"""Configuration class of the scene.
+
+A task of Isaac Lab that imports a name from `isaaclab.scene` gets the object of this name from here.
+"""
 
 from __future__ import annotations
 

@@ -228,7 +228,7 @@ class Asset:
         self.write_root_velocity_to_sim(root_state[:, 7:], env_ids)
 
     def _require_same_base(self, root_pose: Tensor, env_ids: Any) -> None:
-        """Raise a TaskError if the pose of a base that is fixed in the MJCF is set to another pose."""
+        """Raise a TaskError if the task moves a base that is fixed in the MJCF."""
         rows = slice(None) if env_ids is None else env_ids
         now = self.data.root_pos_w[rows]
         if not torch.allclose(root_pose[:, :3], now, atol=1e-4):

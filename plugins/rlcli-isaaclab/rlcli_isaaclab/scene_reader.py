@@ -244,7 +244,7 @@ class SceneReader:
         return [n for n in passive if driven.get(n) != "velocity"]
 
     def sensor_of_bodies(self, name: str, bodies: Any, preserve: bool, key: Key) -> str:
-        """Return the name of a contact sensor that only has the bodies `bodies` of the sensor `name`.
+        """Return the name of a contact sensor that measures only the given bodies of the sensor `name`.
 
         If `bodies` are all bodies of the sensor, return `name`; otherwise add a sensor if there is none with them.
         """
@@ -380,7 +380,7 @@ class SceneReader:
             name_all(spec)
             compiled = spec.compile()
         except (ValueError, TaskError):
-            return  # the check of the task's scene reports what is wrong
+            return  # the check of the task's scene reports the mistake
         scalar_types = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
         joints = [j for j in range(compiled.njnt) if compiled.jnt_type[j] in scalar_types]
         dofs = [int(compiled.jnt_dofadr[j]) for j in joints]
@@ -428,7 +428,7 @@ class SceneReader:
                 entity.setdefault("init", {})[key] = value
 
     def _has_value(self, init: Node, entity: str, pattern: str, value: float, known: Mapping[str, float]) -> bool:
-        """Return whether a pattern matches joints, and all of them have the value in `known`, by joint name (or 0)."""
+        """Return whether all joints that a pattern matches have a value in `known` (joint name -> value, else 0)."""
         matched = self.report.matching([pattern], self.names(entity, "joint") or [], init.key)
         return bool(matched) and all(known.get(n, 0.0) == value for n in matched)
 

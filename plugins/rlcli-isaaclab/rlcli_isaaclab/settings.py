@@ -31,12 +31,12 @@ class Report:
     """
 
     def notes(self, prefix: str = "", where: str = "") -> list[Note]:
-        """Return one note for each key: its path behind `prefix`, its status and the reason. `where` is the file."""
+        """Return one note for each key: `prefix` and its path, its status and the reason. `where` names the file."""
         start = f"{prefix}." if prefix else ""
         return [Note(where, start + ".".join(key), *entry) for key, entry in self.entries.items()]
 
     def user_notes(self, prefix: str = "") -> list[Note]:
-        """Return the notes of keys that were approximated or ignored, or for which something is to do."""
+        """Return the notes of keys that were approximated or ignored, or that the user must translate."""
         return [note for note in self.notes(prefix) if note.status not in ("mapped", "default")]
 
     def problem(self, key: Key, message: str, hint: str | None = None) -> None:
@@ -44,7 +44,7 @@ class Report:
         self.problems.append(Problem("configuration", ".".join(map(str, key)), message, hint))
 
     def matching(self, patterns: Any, names: Sequence[str], key: Key) -> list[str]:
-        """Return the joints that one of the names or regular expressions in a file matches, in the order of `names`.
+        """Return the joints in `names` that match one of `patterns`: names or regular expressions from a file.
 
         A pattern that is no text, no regular expression, or takes long to compare, is recorded as a mistake.
         """
@@ -171,7 +171,7 @@ _FACADES = {
 
 
 def to_plain(value: Any) -> Any:
-    """Return a setting as a YAML task can hold it: tuples become lists, and infinities become +-1e9."""
+    """Return a setting in a form that a YAML task can hold: tuples become lists, and infinities become +-1e9."""
     if isinstance(value, Mapping):
         return {str(key): to_plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

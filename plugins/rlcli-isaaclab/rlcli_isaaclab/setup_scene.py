@@ -63,7 +63,7 @@ def running(setup: Setup) -> Iterator[None]:
 
 
 class Spawn:
-    """Replacement of a function of Isaac Lab that spawns a prim, such as a light, by its configuration."""
+    """Replacement of a function of Isaac Lab that creates a prim, such as a light, from a configuration."""
 
     def __init__(self, name: str) -> None:
         self.__name__ = self.__qualname__ = name
@@ -92,7 +92,7 @@ def create_prim(
     usd_path: str | None = None,
     **other: Any,
 ) -> None:
-    """Store the USD file that is spawned. A prim that only groups others has no counterpart: then do nothing."""
+    """Record the USD file of a new prim. A prim that only groups other prims needs no record: then do nothing."""
     if usd_path is not None:
         from rlcli_isaaclab.sim import UsdFileCfg
 

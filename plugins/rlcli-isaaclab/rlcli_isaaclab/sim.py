@@ -1,4 +1,6 @@
-"""Configuration classes of the simulation and of models, shapes, lights and materials. Names as in `isaaclab.sim`.
+"""Configuration classes of the simulation and of models, shapes, lights and materials.
+
+A task of Isaac Lab that imports a name from `isaaclab.sim` gets the object of this name from here.
 
 Settings of Isaac Sim without a counterpart are accepted and reported as ignored; docs/guides/isaac-lab.md lists the
 settings that have an effect.

@@ -17,7 +17,7 @@ _STALE = "_isaaclab_stale_state"
 
 
 class StepCode(Protocol):
-    """Protocol of an object with code that runs before each physics step, and with tensors for checkpoints."""
+    """Interface of an object whose code runs before each physics step, and whose tensors are saved in checkpoints."""
 
     def apply(self) -> None:
         """Write targets and forces for the next physics step."""
@@ -30,7 +30,7 @@ class StepCode(Protocol):
 
 
 class Substeps:
-    """Caller of a task's code before each physics step of an environment.
+    """Adapter that calls a task's code before each physics step of an environment.
 
     rlcli caches values such as poses of bodies once per environment step. If the code reads such a value after the
     first physics step of an environment step, the cached values are updated first, once per physics step.

@@ -22,7 +22,7 @@ class Entry:
     note: str | None = None
     """Note for the user on how the value of the counterpart differs from Isaac Lab's; None: it does not differ."""
     fixed: Mapping[str, Any] = field(default_factory=dict)
-    """Parameters of the counterpart whose values are constants, or the default of `asset_cfg`, in Isaac Lab's code."""
+    """Parameters of the counterpart that Isaac Lab's code sets to constants, or to the default of `asset_cfg`."""
 
 
 def _pose(value: Mapping[str, Any]) -> dict[str, Any]:
@@ -56,7 +56,7 @@ def _names(value: Any) -> dict[str, Any]:
 
 
 def _unwrap_single(value: Any) -> dict[str, Any]:
-    """Return the only element of a list as `sensor`. The check of the term rejects longer lists."""
+    """Return the parameter `sensor` from a list with one sensor. The check of the term rejects longer lists."""
     return {"sensor": value[0] if len(value) == 1 else list(value)}
 
 

@@ -59,7 +59,7 @@ class TermReader(ObjectReader):
         self.reads_commands = any(
             function is command_resample or _READS_COMMAND in file_text(function) for function in _functions(data)
         )
-        """Whether the user's code reads or changes the object of a command, which then needs Isaac Lab's attributes."""
+        """Whether the user's code reads or changes a command term, which then needs Isaac Lab's attributes."""
         self.stubs: dict[str, tuple[str, dict[str, Any]]] = {}
         """Functions of which the imported YAML only has the name: name -> (section of the term, its parameters)."""
 
@@ -218,7 +218,7 @@ class TermReader(ObjectReader):
     def _find_builtin(self, section: str, name: str | None) -> tuple[str | None, Entry]:
         """Return rlcli's name of one of Isaac Lab's terms, and its entry in `table.py`.
 
-        The name is None if rlcli has no such term; a term without entry has an empty one.
+        The name is None if rlcli has no such term. For a term without an entry, the returned entry is empty.
         """
         if name is None:
             return None, Entry()
@@ -284,7 +284,7 @@ class TermReader(ObjectReader):
             elif value is not None or (target in known and known[target].required):
                 config[target] = to_plain(value)
         if command is not None and command.required and command.name not in config:
-            config[command.name] = "base_velocity"  # terms of Isaac Lab without command_name use this command
+            config[command.name] = "base_velocity"  # Isaac Lab's terms use this command if command_name is not set
         return config
 
     def _read_gear_ratios(self, params: Node, ratios: Mapping[str, float]) -> Any:

@@ -39,7 +39,7 @@ from rlcli_isaaclab.utils.buffers import set_tensors, tensors_of
 
 _RESERVED = {name for model in SECTIONS.values() for name in model.model_fields} | {"params"}
 _PLAIN: dict[Any, Any] = {float: Number, int: int | Number, bool: bool, str: str}
-"""Annotation of a parameter -> type by which rlcli checks its value. As Isaac Lab checks none, `int` also takes 0.5."""
+"""Annotation of a parameter -> type by which rlcli checks it. Isaac Lab checks no types, so `int` also accepts 0.5."""
 
 
 _Nothing = Annotated[list[str], Field(max_length=0)]
@@ -216,7 +216,7 @@ class SettingTerm:
 
 
 def key_of(name: str) -> str:
-    """Return the YAML key of a parameter: its name, and a `_` if terms have a setting of that name, as `weight`."""
+    """Return the YAML key of a parameter: its name, with `_` added if terms have a setting of this name (`weight`)."""
     return f"{name}_" if name in _RESERVED else name
 
 
@@ -242,9 +242,9 @@ def entity_data(settings: Any) -> dict[str, Any]:
 
 
 _CHECKS_FOR_LIST = re.compile(r"isinstance\([\w.]+\.(joint|body)_ids, list\)")
-"""Code of terms that need the ids of joints or bodies as a list. Other terms get tensors, which are faster on a GPU."""
+"""Source text of terms that need the ids of joints or bodies as a list. Other terms get tensors: faster on a GPU."""
 _AFTER_RESET = {"rewards": ("reward_manager", torch.float32), "terminations": ("termination_manager", torch.bool)}
-"""Sections whose terms Isaac Lab first calls in the first step -> (their manager, the type of their values)."""
+"""Section whose terms Isaac Lab calls for the first time in the first step -> (its manager, the type of the values)."""
 
 
 class _Bound:
@@ -327,7 +327,7 @@ class _BoundCommand(_BoundObject):
 
     def metrics(self) -> dict[str, Tensor]:
         """Return the metrics that the user's class computes, by name. (num_envs,) each"""
-        if self._has_command:  # metrics of a command that was never sampled have no meaning
+        if self._has_command:  # before the first command is sampled, the metrics have no meaning
             self.term._update_metrics()
         return dict(self.term.metrics)
 
@@ -412,7 +412,7 @@ def _set_members(target: Any, values: Mapping[str, Any]) -> None:
 
 
 def _to_namespace(value: Any) -> Any:
-    """Return a dict, nested ones too, as an object with its keys as attributes; other values unchanged."""
+    """Return a dict as an object with its keys as attributes, nested dicts too; return other values unchanged."""
     if isinstance(value, dict) and all(str(key).isidentifier() for key in value):
         return SimpleNamespace(**{key: _to_namespace(item) for key, item in value.items()})
     return value

@@ -1,4 +1,7 @@
-"""Configuration classes of the terrain. Names as in `isaaclab.terrains`."""
+"""Configuration classes of the terrain.
+
+A task of Isaac Lab that imports a name from `isaaclab.terrains` gets the object of this name from here.
+"""
 
 from __future__ import annotations
 

@@ -51,7 +51,7 @@ class _Xformable:
         self._prim = prim
 
     def ComputeLocalToWorldTransform(self, time: Any = None) -> Any:  # noqa: N802
-        """Return the pose of the prim in the world frame, with the methods of a USD matrix that read it."""
+        """Return the pose of the prim in the world frame, as an object with the methods of a USD matrix."""
         position, quat = self._prim.pose()
         w, x, y, z = quat.tolist()
         turn = SimpleNamespace(real=w, imaginary=(x, y, z), GetReal=lambda: w, GetImaginary=lambda: (x, y, z))

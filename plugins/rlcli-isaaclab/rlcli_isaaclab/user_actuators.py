@@ -1,4 +1,4 @@
-"""Actuator models that the user defines: subclasses of `ActuatorBase`, which compute efforts in place of rlcli's."""
+"""Support for actuator models of the user (subclasses of `ActuatorBase`), which replace rlcli's actuator models."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ from rlcli.registry import is_framework
 
 
 def code_of(function: Any) -> Any:
-    """Return the function or class that has the code of `function`, which may be a partial or a callable object."""
+    """Return the function or class that contains the code of a callable, which may be a partial or an object."""
     while isinstance(function, functools.partial):
         function = function.func
     return function if inspect.isfunction(function) or inspect.isclass(function) else type(function)

@@ -1,4 +1,7 @@
-"""The environment and its configuration. Names as in `isaaclab.envs`."""
+"""The environment and its configuration.
+
+A task of Isaac Lab that imports a name from `isaaclab.envs` gets the object of this name from here.
+"""
 
 from __future__ import annotations
 

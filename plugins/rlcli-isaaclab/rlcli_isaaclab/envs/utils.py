@@ -1,4 +1,7 @@
-"""Decorators of term functions. Names as in `isaaclab.envs.utils.io_descriptors`."""
+"""Decorators of term functions.
+
+A task of Isaac Lab that imports a name from `isaaclab.envs.utils.io_descriptors` gets the object from here.
+"""
 
 from __future__ import annotations
 

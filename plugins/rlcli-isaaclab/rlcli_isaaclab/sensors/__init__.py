@@ -1,4 +1,7 @@
-"""Configuration classes of sensors. Names as in `isaaclab.sensors`."""
+"""Configuration classes of sensors.
+
+A task of Isaac Lab that imports a name from `isaaclab.sensors` gets the object of this name from here.
+"""
 
 from __future__ import annotations
 

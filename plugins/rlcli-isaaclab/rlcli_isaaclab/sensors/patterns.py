@@ -1,4 +1,7 @@
-"""Patterns of rays for ray sensors: start points and directions. Names as in `isaaclab.sensors.patterns`."""
+"""Patterns of rays for ray sensors: start points and directions.
+
+A task of Isaac Lab that imports a name from `isaaclab.sensors.patterns` gets the object of this name from here.
+"""
 
 from __future__ import annotations
 

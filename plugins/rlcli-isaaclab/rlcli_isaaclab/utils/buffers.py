@@ -1,4 +1,7 @@
-"""Histories of tensors. Names as in `isaaclab.utils.buffers`."""
+"""Buffers that store tensors of past steps: a history, and a delay.
+
+A task of Isaac Lab that imports a name from `isaaclab.utils.buffers` gets the object of this name from here.
+"""
 
 from __future__ import annotations
 
@@ -96,7 +99,7 @@ class DelayBuffer:
         self._history.reset(batch_ids)
 
     def compute(self, data: Tensor) -> Tensor:
-        """Add a value for every environment, and return the value of `time_lags` steps ago. (batch, ...) each"""
+        """Add a value for every environment, and return the values of `time_lags` steps ago. (batch, ...) each"""
         self._history.append(data)
         return self._history[self.time_lags].clone()
 

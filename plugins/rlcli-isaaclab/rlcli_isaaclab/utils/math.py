@@ -1,4 +1,6 @@
-"""Rotations (w, x, y, z), angles and random samples. Names as in `isaaclab.utils.math`.
+"""Rotations (w, x, y, z), angles and random samples.
+
+A task of Isaac Lab that imports a name from `isaaclab.utils.math` gets the object of this name from here.
 
 `sample_*` draw from torch's global generator. Unlike the samples of rlcli's events, they depend on the number of
 environments.

@@ -1,4 +1,7 @@
-"""Modifiers, which change an observation before noise is added. Names as in `isaaclab.utils.modifiers`."""
+"""Modifiers, which change an observation before noise is added.
+
+A task of Isaac Lab that imports a name from `isaaclab.utils.modifiers` gets the object of this name from here.
+"""
 
 from __future__ import annotations
 

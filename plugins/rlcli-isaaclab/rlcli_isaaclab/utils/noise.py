@@ -1,4 +1,7 @@
-"""Observation noise: functions, noise models and their settings. Names as in `isaaclab.utils.noise`."""
+"""Observation noise: functions, noise models and their settings.
+
+A task of Isaac Lab that imports a name from `isaaclab.utils.noise` gets the object of this name from here.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Poses as 4 x 4 matrices, Euler angles and interpolation of rotations. Names as in `isaaclab.utils.math`."""
+"""Poses as 4 x 4 matrices, Euler angles and interpolation of rotations.
+
+A task of Isaac Lab that imports a name from `isaaclab.utils.math` gets the object of this name from here.
+"""
 
 from __future__ import annotations
 

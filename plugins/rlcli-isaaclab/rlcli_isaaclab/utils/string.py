@@ -1,4 +1,7 @@
-"""Functions that convert names, and that select names by regexes. Names as in `isaaclab.utils.string`."""
+"""Functions that convert names, and that select names by regexes.
+
+A task of Isaac Lab that imports a name from `isaaclab.utils.string` gets the object of this name from here.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Types of Isaac Lab's utilities. Names as in `isaaclab.utils.types`."""
+"""`ArticulationActions`, the joint targets that actuator models receive and return.
+
+A task of Isaac Lab that imports a name from `isaaclab.utils.types` gets the object of this name from here.
+"""
 
 from __future__ import annotations
 

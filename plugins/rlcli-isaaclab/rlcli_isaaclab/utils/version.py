@@ -1,4 +1,7 @@
-"""Versions of Isaac Lab and Isaac Sim, which task files compare. Names as in `isaaclab.utils.version`."""
+"""Versions of Isaac Lab and Isaac Sim, which task files compare.
+
+A task of Isaac Lab that imports a name from `isaaclab.utils.version` gets the object of this name from here.
+"""
 
 from __future__ import annotations
 
