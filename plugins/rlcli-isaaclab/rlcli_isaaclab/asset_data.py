@@ -14,6 +14,7 @@ from rlcli.scene.entity import Entity
 from rlcli.scene.entity_data import EntityData
 from rlcli.sim.env_selection import ALL
 from rlcli.sim.rotations import conjugate, multiply, rotate, rotate_inverse
+from rlcli_isaaclab.absent import user_place
 from rlcli_isaaclab.substeps import update_state
 from rlcli_isaaclab.utils.math import quat_from_matrix
 
@@ -68,16 +69,28 @@ class Data:
         except AttributeError:
             known = [n for n in (*dir(type(self)), *dir(self._data), *_DATA_NAMES) if not n.startswith("_")]
             hint = did_you_mean(name, known) or f"its attributes: {listing(known, 60)}"
-            raise AttributeError(f"asset.data has no '{name}'; {hint}") from None
+            raise AttributeError(f"{user_place()}asset.data has no '{name}'; {hint}") from None
+
+    @property
+    def joint_stiffness(self) -> Tensor:
+        """Stiffness of the joints, after events. (num_envs, joints) [N/m or N m/rad]"""
+        return self._gains(1)
+
+    @property
+    def joint_damping(self) -> Tensor:
+        """Damping of the joints, after events. (num_envs, joints) [N s/m or N m s/rad]"""
+        return self._gains(2)
 
     def _gains(self, column: int) -> Tensor:
         """Return stiffness (column 1) or damping (column 2) of the joints, from the model and the actuator models."""
-        model, entity = self._env.engine.model, self._entity
+        engine, entity = self._env.engine, self._entity
         found = torch.zeros(self._env.num_envs, len(self.joint_names), device=self._env.device)
         if column == 2:
-            found += torch.as_tensor(model.dof_damping[entity.dof_columns.cpu()], dtype=torch.float32).to(found.device)
-        for joint, actuator in (*entity.actuators_of("position"), *entity.actuators_of("velocity")):
-            found[:, joint] -= float(model.actuator_biasprm[actuator, column])
+            found += engine.expand("dof_damping")[:, entity.dof_columns].float()
+        pairs = (*entity.actuators_of("position"), *entity.actuators_of("velocity"))
+        bias = engine.expand("actuator_biasprm") if pairs else None
+        for joint, actuator in pairs:
+            found[:, joint] -= bias[:, actuator, column].float()
         for actuators in entity.actuators:
             found[:, actuators.joints] = actuators.stiffness if column == 1 else actuators.damping
         return found

@@ -80,7 +80,11 @@ class ManagerBasedRLEnv(gymnasium.Env):
             if own is not None and "_own" not in self.__dict__:
                 self.__dict__["_own"] = object.__new__(own)
                 self._own.__dict__ = self.__dict__  # the object has the attributes of the environment
-                self._own.__init__(self.cfg)
+                try:
+                    self._own.__init__(self.cfg)
+                except BaseException:  # the next use of a member has to fail as well
+                    del self.__dict__["_own"]
+                    raise
             if own is not None and (name in self.__dict__ or hasattr(own, name)):
                 return getattr(self._own, name)
             if name.endswith("_manager") and name in dir(type(self)):
@@ -212,7 +216,7 @@ class ManagerBasedRLEnv(gymnasium.Env):
         self.scene.add_frames(context.frames)
         if context.cfg is not None and self._context is not context:
             self._context, self.cfg = context, copy.deepcopy(context.cfg)
-            self.cfg.scene.num_envs = self.managed.num_envs
+            self.cfg.scene.num_envs, self.cfg.sim.device = self.managed.num_envs, str(self.managed.device)
             self.scene.user_cfg = self.cfg.scene
             for settings in vars(self.cfg.scene).values():
                 if isinstance(getattr(settings, "prim_path", None), str):

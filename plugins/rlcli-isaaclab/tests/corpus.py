@@ -307,7 +307,7 @@ def faulty_messages(rows: dict[str, Any]) -> list[str]:
     """
     import rlcli.errors
 
-    ours = {name for name, kind in vars(rlcli.errors).items() if isinstance(kind, type)}
+    ours = {"NameProblem", *(name for name, kind in vars(rlcli.errors).items() if isinstance(kind, type))}
     found = []
     for task, row in sorted(rows.items()):
         kind, _, text = row["reason"].partition(": ")

@@ -224,3 +224,31 @@ def difference(env):
     resolved = rover(tmp_path / "task", code, [(ACTIONS, members), ("func=mdp.base_lin_vel", "func=difference")])
     _, result = stepped(resolved)
     assert not result.obs["policy"].any()
+
+
+def test_gains_of_joints_after_an_event(tmp_path):
+    code = """
+def scale(env):
+    data = env.scene["robot"].data
+    pairs = ((data.joint_stiffness, data.default_joint_stiffness), (data.joint_damping, data.default_joint_damping))
+    return torch.cat([value[:, :1] / default[:, :1] for value, default in pairs], dim=1)
+"""
+    params = (
+        "{'asset_cfg': SceneEntityCfg('robot', joint_names=['arm']), 'operation': 'scale',"
+        " 'stiffness_distribution_params': (1.5, 1.5), 'damping_distribution_params': (0.5, 0.5)}"
+    )
+    gains = f"EventTermCfg(func=mdp.randomize_actuator_gains, mode='startup', params={params})"
+    replaced = [("func=mdp.base_lin_vel", "func=scale")]
+    _, result = stepped(rover(tmp_path / "task", code, replaced, events={"gains": gains}))
+    torch.testing.assert_close(
+        result.obs["policy"], torch.tensor([[1.5, 0.6 / 1.1]]).expand(4, 2)
+    )  # the MJCF has damping 0.1
+
+
+def test_unknown_data_of_an_asset_has_a_place(tmp_path):
+    code = """
+def wrong(env):
+    return env.scene["robot"].data.joint_warmth
+"""
+    with pytest.raises(Exception, match=r"rover_env\.py:15: asset\.data has no 'joint_warmth'"):
+        stepped(rover(tmp_path / "task", code, [("func=mdp.base_lin_vel", "func=wrong")]))

@@ -28,9 +28,9 @@ def forget_modules():
     known = set(sys.modules)
     yield
     for name in set(sys.modules) - known:
-        if name.partition(".")[0] in ("farm", "carts", "pond", "balance_own"):
+        if name.partition(".")[0] in ("farm", "carts", "pond", "lake", "balance_own"):
             del sys.modules[name]
-    for task in ("Template-Cartpole-v0", "Pond-v0"):
+    for task in ("Template-Cartpole-v0", "Pond-v0", "Lake-v0"):
         gymnasium.registry.pop(task, None)
 
 
@@ -291,6 +291,35 @@ def test_term_calls_a_method_of_the_own_environment_class(tmp_path):
     (package / "__init__.py").write_text("from . import rover_env\n")
     _, result = stepped(resolve(find_task(f"{package}:Pond-v0")))
     assert result.reward.tolist() == pytest.approx([0.02 * (1.0 + 3 * 0.02 / 0.5)] * 4)
+
+
+STARTS = """
+from isaaclab.envs import ManagerBasedRLEnv
+
+class RoverEnv(ManagerBasedRLEnv):
+    def __init__(self, cfg, render_mode=None, **kwargs):
+        assert torch.get_num_threads() < 1000
+        self.ones = torch.ones(cfg.scene.num_envs, device=cfg.sim.device)
+        super().__init__(cfg, render_mode)
+
+def ones(env):
+    return env.ones
+"""
+
+
+def test_own_environment_class_creates_tensors_on_the_device_of_its_settings(tmp_path, monkeypatch):
+    rover(tmp_path / "rover", STARTS, rewards={"own": "RewardTermCfg(func=ones, weight=1.0)"})
+    package = shutil.copytree(tmp_path / "rover", tmp_path / "lake")
+    file = package / "rover_env.py"
+    register = "gymnasium.register('Lake-v0', entry_point=f'{__name__}:RoverEnv', kwargs={'env_cfg_entry_point': %s})"
+    file.write_text(f"{file.read_text()}\nimport gymnasium\n{register % 'RoverEnvCfg'}\n")
+    (package / "__init__.py").write_text("from . import rover_env\n")
+    resolved = resolve(find_task(f"{package}:Lake-v0"))
+    _, result = stepped(resolved)
+    assert result.reward.tolist() == pytest.approx([0.02] * 4)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 5000)  # the class fails: so does each use of its members
+    with pytest.raises(AssertionError):
+        stepped(resolved)
 
 
 MOTION = """
