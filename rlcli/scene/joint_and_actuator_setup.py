@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 from rlcli.config.schema import EntityConfig, JointConfig
-from rlcli.scene.names import NameProblem, SceneProblem, match
+from rlcli.scene.names import NameProblem, SceneProblem, match, search
 
 _KNOWN_ACTUATORS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtDyn.mjDYN_NONE), int(mujoco.mjtGain.mjGAIN_FIXED))
 """Transmission, dynamics and gain types that rlcli's motor, position and velocity actuators can have."""
@@ -161,9 +161,9 @@ def joint_settings(entity: EntityConfig, joint: str) -> JointConfig:
     """Return the settings of a joint from `joints` of its entity; if several patterns match, later ones win."""
     merged: dict[str, object] = {}
     for pattern, change in entity.joints.items():
-        with contextlib.suppress(NameProblem):  # a pattern that matches other joints only is no error here
-            match(pattern, [joint], "joint")
-            merged.update(change.model_dump(exclude_none=True))
+        with contextlib.suppress(NameProblem):  # an invalid pattern: reported where the settings are applied
+            if pattern == joint or search(pattern, [joint], "joint"):
+                merged.update(change.model_dump(exclude_none=True))
     return JointConfig.model_validate(merged)
 
 

@@ -5,6 +5,7 @@ Commands sample reachable goals from these positions.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 
 import mujoco
@@ -15,6 +16,10 @@ _COUNT = 2048
 """Number of random poses that `reachable_positions` samples."""
 _SHARES = np.linspace(0.125, 1.0, 8)
 """Points of the straight way from the default pose to a pose at which contacts are computed (0: start, 1: end)."""
+_MEMORY = 8
+"""Largest number of results that `reachable_positions` keeps: `rlcli check` builds the same environment many times."""
+_results: dict[bytes, NDArray[np.float64]] = {}
+"""Digest of the arguments of `reachable_positions` -> its result."""
 
 
 def reachable_positions(
@@ -37,6 +42,9 @@ def reachable_positions(
         body: id of the body.
         offsets: smallest and largest offset of a joint from its default position [m or rad], within the joint's limits.
     """
+    key = _digest(model, np.array([*default, *joints, body, *offsets, len(joints)]))
+    if key in _results:
+        return _results[key]
     data = mujoco.MjData(model)
     usual = _contacts(model, data, default)
     poses = random_poses(model, default, joints, offsets, _COUNT)
@@ -50,7 +58,18 @@ def reachable_positions(
         data.qpos[:] = qpos
         mujoco.mj_kinematics(model, data)
         places.append(data.xpos[body].copy())
-    return np.array(places)
+    if len(_results) >= _MEMORY:
+        _results.clear()
+    _results[key] = np.array(places)
+    _results[key].flags.writeable = False
+    return _results[key]
+
+
+def _digest(model: mujoco.MjModel, numbers: NDArray[np.float64]) -> bytes:
+    """Return a digest of a compiled model, meshes and names included, and of an array."""
+    content = np.zeros(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, content)
+    return hashlib.blake2b(numbers.tobytes(), key=hashlib.blake2b(content).digest()).digest()
 
 
 def random_poses(

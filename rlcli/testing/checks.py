@@ -14,7 +14,7 @@ from pathlib import Path
 import torch
 
 from rlcli.errors import ConfigError, DependencyError, DeviceError, MachineError, ShapeError, TaskError, require_known
-from rlcli.progress import tracked
+from rlcli.progress import track, tracked
 from rlcli.runs.atomic_io import write_atomic
 from rlcli.testing import episode_checks, same_result_checks, step_and_file_checks
 from rlcli.testing.findings import Finding, NotRunError, task_error_text
@@ -90,7 +90,8 @@ def check_task(
             return broken
         for name in tracked(selected, "checks", len(selected)):
             try:
-                findings = list(_run(name, subject, found))
+                with track(name):
+                    findings = list(_run(name, subject, found))
             except NotRunError as reason:
                 on_check(name, None)
                 on_note(name, f"not run: {reason}")

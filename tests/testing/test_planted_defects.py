@@ -1,9 +1,11 @@
 """Each check finds the planted defect that breaks its clause of the contract, and its place."""
 
+import contextlib
 from pathlib import Path
 
 import pytest
 
+from rlcli import progress
 from rlcli.testing import CHECKS, check_task
 
 ACROBOT = Path(__file__).parents[2] / "plugins" / "rlcli-example-acrobot" / "rlcli_example_acrobot"
@@ -366,3 +368,17 @@ def test_check_task_keeps_random_state(managed):
     torch.manual_seed(5)
     check(managed)
     assert torch.equal(torch.rand(1), expected)
+
+
+def test_progress_names_the_running_check(managed, monkeypatch):
+    running: list[str] = []
+
+    def observe(subject):
+        running.extend(work.what for work in shown[0])
+        return []
+
+    shown = []
+    monkeypatch.setattr(progress, "view", lambda works: shown.append(works) or contextlib.nullcontext())
+    monkeypatch.setitem(CHECKS, "names", observe)
+    check_task(managed.write(), only=["names"])
+    assert running == ["checks", "names"]
