@@ -66,6 +66,11 @@ def _without_gpu(file: str) -> contextlib.AbstractContextManager[Any]:
     return contextlib.nullcontext()
 
 
+def executed_files() -> list[str]:
+    """Return the paths of the task files that this process has executed, in order."""
+    return list(_by_file)
+
+
 class _KnownFileLoader(Loader):
     """Loader of a task file that was already imported under another name: it returns the same module object."""
 
