@@ -5,7 +5,6 @@ Exceptions of a command, of a task's code or of a library become error messages 
 
 from __future__ import annotations
 
-import builtins
 import errno
 import functools
 import importlib
@@ -39,6 +38,7 @@ from rlcli.errors import (
 from rlcli.machine.garbage_collection import delay_garbage_collection
 from rlcli.machine.memory import memory_error
 from rlcli.registry import OWN, TRAINERS, catalog, load_entry, load_object, malformed_metadata_ignored
+from rlcli.registry.changed_modules import ModuleCopies, change_of_module
 from rlcli.registry.task_code_monitor import (
     error_of_task,
     exit_refused,
@@ -46,7 +46,6 @@ from rlcli.registry.task_code_monitor import (
     place_in_task,
     raised_by_task,
     report_lasting_threads,
-    restore_built_in,
 )
 from rlcli.safe_text import remember_given
 from rlcli.settings import settings_file, use_settings
@@ -198,7 +197,7 @@ def _require_words(arguments: list[str]) -> None:
 
 
 def _run(arguments: list[str]) -> int:
-    built_in = vars(builtins).copy()
+    copies = ModuleCopies()
     broken: TaskError | None = None
     try:
         _require_words(arguments)
@@ -207,7 +206,7 @@ def _run(arguments: list[str]) -> int:
             try:
                 result = build(_command_name(arguments))(arguments, prog_name="rlcli", standalone_mode=False)
             finally:
-                broken = restore_built_in(built_in)
+                broken = copies.restore()
         if result == INTERRUPTED:  # typer turns Ctrl-C into this exit code
             raise KeyboardInterrupt
         return result if isinstance(result, int) else 0
@@ -220,8 +219,8 @@ def _run(arguments: list[str]) -> int:
     except BaseException as raised:  # the code of a task may raise any exception
         cause = raised.error if isinstance(raised, BodyError) else raised
         failure = _as_rlcli_error(cause, arguments)
-        if failure.kind == "bug" and broken is not None:
-            failure = broken
+        if failure.kind == "bug":
+            failure = broken or (not isinstance(cause, SystemExit) and change_of_module(cause)) or failure
         if failure.kind == "bug" and isinstance(cause, SystemExit):
             # the exception is not from a task or plugin: typer itself ends completions and closed pipes in this way
             raise

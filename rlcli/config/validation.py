@@ -14,6 +14,7 @@ from rlcli.config.layers import Layers, Origin, document_origins, override_place
 from rlcli.config.model_option import MODELS, given_settings, model_path
 from rlcli.config.older_success import upgraded
 from rlcli.config.other_framework_keys import foreign_keys, merge_translation, move_foreign_keys
+from rlcli.config.possible_success import impossible_conditions
 from rlcli.config.schema import AgentConfig, TaskConfig, TermConfig
 from rlcli.config.strict_yaml import Document, Path
 from rlcli.config.term_signatures import (
@@ -331,7 +332,9 @@ class TaskCheck:
             self._require_direct(data)
         if self.problems or not isinstance(task, TaskConfig):
             return None
-        return with_terms(task, terms, params)
+        task = with_terms(task, terms, params)
+        self.add(*impossible_conditions(task, self.layers))
+        return task
 
     def _validate(self, model: type[BaseModel], data: Any, at: Path) -> BaseModel | None:
         """Validate the data at a path with a model; add the problems and return None if it is not valid."""
@@ -376,8 +379,7 @@ class TaskCheck:
 
     def _siblings(self, path: Path) -> list[str]:
         """Return the names of all terms in the section (or observation group) of the term at a path."""
-        terms = _mapping(self.layers.get(path[:-1]))
-        return [name for name, term in terms.items() if isinstance(term, dict) and "func" in term]
+        return [name for name, term in _mapping(self.layers.get(path[:-1])).items() if "func" in _mapping(term)]
 
     def _report_unknown_term(self, section: str, path: Path, name: str) -> None:
         known, other = self.vocabulary.names(section), self.vocabulary.other_section(section, name)

@@ -69,6 +69,11 @@ def _without_gpu(file: str) -> contextlib.AbstractContextManager[Any]:
     return contextlib.nullcontext()
 
 
+def executed_files() -> list[str]:
+    """Return the paths of the task files that this process has executed, in order."""
+    return list(_by_file)
+
+
 class _KnownFileLoader(Loader):
     """Loader for a task file that was imported before under another name; it returns the same module object again."""
 

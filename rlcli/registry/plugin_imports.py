@@ -127,6 +127,8 @@ def _plugin_named(entry: Entry, failure: str, passed_on: type[RlcliError]) -> It
 def import_object(reference: str) -> Any:
     """Import and return the object of a reference `package.module:Name`. What the import prints goes to stderr."""
     name, _, attributes = reference.rpartition(":")
+    if not name:
+        raise ValueError("it names no object of a module; write MODULE:OBJECT")
     with contain_side_effects():
         module = importlib.import_module(name)
     return operator.attrgetter(attributes)(module)

@@ -1,13 +1,10 @@
 """Monitor of the code of tasks and plugins while a command runs; it reports errors, warnings and calls that hang."""
 
-import builtins
 import contextlib
 import functools
 import gc
-import linecache
 import logging
 import os
-import re
 import sys
 import sysconfig
 import threading
@@ -20,7 +17,7 @@ from types import CodeType, FrameType
 from typing import Any, NoReturn
 
 import rlcli
-from rlcli.errors import TaskError, error_text, error_with_type, listing, short_error
+from rlcli.errors import TaskError, error_text, error_with_type, short_error
 from rlcli.registry.entries import FORMATS, OWN, TASKS, TRAINERS, Entry, catalog
 from rlcli.registry.formats import is_framework
 from rlcli.safe_text import shorten
@@ -33,7 +30,7 @@ _SAMPLE_S = 1.0
 """Time between two looks at the running code [s]."""
 _MOST_TEXT = 200
 """Largest length of a reported warning [characters]; longer ones are cut."""
-_BUILT_IN = vars(builtins)
+_monotonic = time.monotonic  # the thread `_Watch` needs it even if a task deletes or replaces it
 _ENTRIES = ("rlcli.cli.app", "rlcli.envs.sharding.worker")
 """Modules that start a command or a worker. Frames outside of them belong to the program that called rlcli."""
 
@@ -76,42 +73,14 @@ def raised_by_task(error: BaseException) -> bool:
     return bool(own) and is_task_code(own[-1])
 
 
-def restore_built_in(before: dict[str, Any]) -> TaskError | None:
-    """Restore the built-in functions that code of a task has deleted or replaced; return an error that names them.
-
-    No built-in function is called until they are restored.
-
-    Args:
-        before: a copy of `vars(builtins)` from before the task's code ran.
-    """
-    changed = [name for name in before if _BUILT_IN.get(name) is not before[name]]
-    if not changed:
-        return None
-    _BUILT_IN.update(before)
-    return TaskError(
-        f"{next(_uses_of_builtins(), '')}code of the task has deleted or replaced the built-in"
-        f" functions {listing(changed, limit=3)}",
-        hint="remove the assignment to `builtins` from the task's code; --debug shows the traceback",
-    )
-
-
-def _uses_of_builtins() -> Iterator[str]:
-    """Yield file and line of the uses of `builtins` in the code of tasks and plugins."""
-    for name, module in list(sys.modules.items()):
-        file = getattr(module, "__file__", None)
-        if isinstance(file, str) and _is_task_file(file, name.partition(".")[0]):
-            for number, line in enumerate(linecache.getlines(file), 1):
-                if re.search(r"(?<!import )\b(__)?builtins(__)?\b", line):
-                    yield f"{file}:{number}: "
-
-
 def is_task_code(frame: FrameType) -> bool:
     """Return whether a frame runs code of a task: a file of an installed plugin, or outside of rlcli and libraries."""
-    return _is_task_file(frame.f_code.co_filename, _module(frame).partition(".")[0])
+    return is_task_file(frame.f_code.co_filename, _module(frame).partition(".")[0])
 
 
 @functools.cache
-def _is_task_file(file: str, package: str) -> bool:
+def is_task_file(file: str, package: str) -> bool:
+    """Return whether a file, a module of the top-level package `package`, is code of a task or plugin."""
     entry = _plugins().get(package)
     if file.startswith("<") or is_framework(package) or (entry is not None and entry.distribution == OWN):
         return False
@@ -137,9 +106,13 @@ def _plugins(groups: tuple[str, ...] = (FORMATS, TRAINERS, TASKS)) -> dict[str, 
 
 @functools.cache
 def _libraries() -> list[Path]:
-    """Return the folders of Python, the installed packages and rlcli."""
-    folders = [Path(path) for name, path in sysconfig.get_paths().items() if name.endswith(("lib", "stdlib"))]
-    return [*folders, Path(rlcli.__file__).parent]
+    """Return the folders of Python, of the installed packages and of rlcli.
+
+    Packages may be in several folders: of a virtual environment, of the system, of the user (`pip install --user`).
+    """
+    folders = [path for name, path in sysconfig.get_paths().items() if name.endswith(("lib", "stdlib"))]
+    folders += [path for path in sys.path if os.path.basename(path) in ("site-packages", "dist-packages")]
+    return [*map(Path, folders), Path(rlcli.__file__).parent]
 
 
 @contextlib.contextmanager
@@ -150,7 +123,7 @@ def observe_task_code() -> Iterator[None]:
     that have not returned after `SLOW_S`. Each line of code is reported once.
     """
     # an earlier command of this process may have filled these caches
-    for function in (warn_once, _is_task_file, _plugins):
+    for function in (warn_once, is_task_file, _plugins):
         function.cache_clear()
     places: set[str] = set()
 
@@ -252,37 +225,47 @@ def frames_of_thread(thread: int | None) -> list[FrameType]:
 
 @contextlib.contextmanager
 def exit_refused() -> Iterator[None]:
-    """Make `os._exit` an error in the `with` block: code of a plugin would end the command without a message.
+    """Make `os._exit` and `os.abort` errors in the `with` block: a plugin would end the command without a message.
 
     Other processes, such as children that a library forks, still end. Another thread ends the command, with a message
     if it runs code of a task.
     """
-    before, process, thread = os._exit, os.getpid(), threading.get_ident()
+    process, thread = os.getpid(), threading.get_ident()
 
-    def refuse(status: int) -> NoReturn:
-        if os.getpid() != process:
-            before(status)
-        if threading.get_ident() != thread:
-            place = place_in_task(sys._getframe(1))
-            if place is not None:
-                warn_once(f"{place}: a thread has ended the command with os._exit({status})")
-            before(status if place is None else TaskError.exit_code)
-        raise SystemExit(f"it called os._exit({status})")
+    def refused(name: str, before: Callable[..., NoReturn]) -> Callable[..., NoReturn]:
+        def refuse(*status: int) -> NoReturn:
+            if os.getpid() != process:
+                before(*status)
+            call = f"os.{name}({', '.join(map(str, status))})"
+            if threading.get_ident() != thread:
+                place = place_in_task(sys._getframe(1))
+                if place is None:
+                    before(*status)
+                warn_once(f"{place}: a thread has ended the command with {call}")
+                end(TaskError.exit_code)
+            raise SystemExit(f"it called {call}")
 
-    os._exit = refuse
+        return refuse
+
+    end = os._exit
+    owners = [os, sys.modules[os.name]]  # `os` has the functions of the module `posix` or `nt`
+    functions = [(owner, name, getattr(owner, name)) for owner in owners for name in ("_exit", "abort")]
+    for owner, name, before in functions:
+        setattr(owner, name, refused(name, before))
     try:
         yield
     finally:
-        os._exit = before
+        for owner, name, before in functions:
+            setattr(owner, name, before)
 
 
 def report_lasting_threads() -> None:
     """Warn of threads of a task that have not ended `SLOW_S` after the command: the process waits for them."""
-    end = time.monotonic() + SLOW_S
+    end = _monotonic() + SLOW_S
     for thread in threading.enumerate():
         place = _innermost_place(frames_of_thread(thread.ident))
         if place and not thread.daemon and thread is not threading.main_thread():
-            thread.join(max(0.0, end - time.monotonic()))
+            thread.join(max(0.0, end - _monotonic()))
             if thread.is_alive():
                 warn_once(f"{place}: a thread still runs {SLOW_S:g} s after the end of the command; Ctrl-C ends it")
 
@@ -295,11 +278,11 @@ class _OwnTime:
 
     def __init__(self, thread: int) -> None:
         self._file = Path(f"/proc/self/task/{thread}/schedstat")
-        self._begin, self._waited_s = time.monotonic(), self._wait_s()
+        self._begin, self._waited_s = _monotonic(), self._wait_s()
 
     def now(self) -> float:
         """Return the time since the start of the clock [s]."""
-        return time.monotonic() - self._begin - (self._wait_s() - self._waited_s)
+        return _monotonic() - self._begin - (self._wait_s() - self._waited_s)
 
     def _wait_s(self) -> float:
         try:

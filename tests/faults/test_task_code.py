@@ -166,6 +166,8 @@ ERRORS = {
     "exec('raise EOFError(7)')": "EOFError: 7",
     "next(iter([]))": "StopIteration",
     "os._exit(7)": "SystemExit: it called os._exit(7)",
+    "exec('import posix; posix._exit(7)')": "SystemExit: it called os._exit(7)",
+    "os.abort()": "SystemExit: it called os.abort()",
     "exec('import typer; raise typer.Exit(0)')": "Exit: 0",
     "exec('import typer; raise typer.Abort')": "Abort",
 }
@@ -226,6 +228,37 @@ def test_hook_that_breaks_built_in_functions_is_named(with_code, start, workers,
     assert "Traceback" not in err
     found = f"code of the task has deleted or replaced the built-in functions {BREAKS[code]}"
     assert f"coin/task.py:{line}: {found}" in err
+
+
+CHANGES = {
+    "torch.zeros = None": "torch.zeros",
+    "time.monotonic = None": "time.monotonic",
+    "vars(time).update(monotonic=None)": "time.__dict__",
+    "del os.replace": "os.replace",
+    "setattr(threading.Thread, 'start', None)": "threading.Thread.start",
+    "sys.modules.clear()": "sys.modules",
+}
+
+
+@pytest.mark.parametrize("code", CHANGES)
+def test_hook_that_breaks_a_library_is_named(with_code, start, code):
+    """The command fails later, in code of rlcli: no frame of the traceback is the task's."""
+    line = with_code("calculate_metrics", f"import sys; torch.backends.cudnn.enabled = False; {code}")
+    process = start(*TRAIN)
+    _, err = process.communicate()
+    assert process.returncode == 4, err
+    assert "Traceback" not in err
+    assert f"coin/task.py:{line}: code of the task changes {CHANGES[code]}, which is probably the reason for" in err
+
+
+def test_hook_that_breaks_a_library_in_a_worker_process_is_named(with_code, start):
+    line = with_code(
+        "calculate_metrics", "self.env.shard.first and setattr(torch, 'where', None)", "num_envs: 32, workers: 2"
+    )
+    process = start(*TRAIN)
+    _, err = process.communicate()
+    assert process.returncode == 4, err
+    assert f"coin/task.py:{line}: code of the task changes torch.where, which is probably" in err
 
 
 def test_thread_of_a_task_that_ends_the_command_is_named(with_code, start):

@@ -70,7 +70,7 @@ BROKEN = {
     "has-no-object": Case("AttributeError", ""),
     "is-no-spec": Case("is a dict, expected a TaskSpec", "SPEC = {'package': 'x'}\n"),
     "names-no-object": Case(
-        "is broken", SPEC, {"entry_points": "[rlcli.tasks]\nnames-no-object-task = names_no_object\n"}
+        "write MODULE:OBJECT", SPEC, {"entry_points": "[rlcli.tasks]\nnames-no-object-task = names_no_object\n"}
     ),
     "newer-api": Case("needs plugin API 99", IMPORT + "SPEC = TaskSpec(__name__, 'x', api=99)\n"),
     "api-is-text": Case(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import builtins
 import contextlib
 import logging
 import os
@@ -20,7 +19,8 @@ from typing import TYPE_CHECKING, Any
 from rlcli.envs.sharding.channel import SPIN_S, Channel, ChannelClosedError
 from rlcli.errors import RlcliError, TaskError
 from rlcli.machine.memory import memory_error
-from rlcli.registry.task_code_monitor import error_of_task, exit_refused, observe_task_code, restore_built_in
+from rlcli.registry.changed_modules import ModuleCopies, change_of_module
+from rlcli.registry.task_code_monitor import error_of_task, exit_refused, observe_task_code
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -103,7 +103,7 @@ def _serve(channel: Channel, arrays: int) -> None:
 
     torch.set_num_threads(1)
     worker = _Worker(channel, arrays)
-    built_in = vars(builtins).copy()
+    copies = ModuleCopies()
     with torch.no_grad():
         while True:
             kind, content = channel.receive()
@@ -112,7 +112,7 @@ def _serve(channel: Channel, arrays: int) -> None:
             except ChannelClosedError:
                 raise
             except:  # noqa: E722 - the task may have deleted the name BaseException
-                broken = restore_built_in(built_in)
+                broken = copies.restore()
                 error = sys.exception()
                 assert error is not None
                 channel.send(ERROR, _PortableError.from_exception(error, broken))
@@ -248,7 +248,7 @@ class _PortableError:
         """
         trace = "".join(traceback.format_exception(error))
         if not isinstance(error, RlcliError):
-            error = memory_error(error) or error_of_task(error) or broken or error
+            error = memory_error(error) or error_of_task(error) or broken or change_of_module(error) or error
         if isinstance(error, RlcliError):
             return _PortableError(type(error), error.args, dict(error.__dict__), trace)
         if type(error).__module__ == "builtins":

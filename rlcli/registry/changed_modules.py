@@ -1,0 +1,157 @@
+"""Changes that the code of a task or plugin makes to modules of Python and of libraries, such as `time.time = None`."""
+
+import ast
+import builtins
+import os
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from rlcli.errors import TaskError, listing, short_error
+from rlcli.registry.framework_imports import executed_files
+from rlcli.registry.task_code_monitor import is_task_file
+
+_MAX_BYTES = 1_000_000
+"""Largest file that is searched for changes [bytes]."""
+_CHANGING = ("clear", "pop", "popitem", "update", "__setitem__", "__delitem__")
+"""Methods of dictionaries that delete or replace names, as in `sys.modules.clear()`."""
+
+
+class ModuleCopies:
+    """Copies of modules that rlcli needs to report an error, from before the code of a task runs."""
+
+    def __init__(self) -> None:
+        self._loaded = sys.modules
+        self._modules = sys.modules.copy()
+        self._built_in, self._built_in_before = vars(builtins), vars(builtins).copy()
+        self._others = [(vars(module), vars(module).copy()) for module in (os, threading, time)]
+
+    def restore(self, is_callable: type = callable) -> TaskError | None:  # type: ignore[assignment]
+        """Restore what code of a task has deleted or replaced; return an error if these were built-in functions.
+
+        Restored are built-in functions, functions of other modules in place of which there is now a value or nothing,
+        and modules that are missing in `sys.modules`. No built-in function is called until they are restored.
+
+        Args:
+            is_callable: the built-in `callable`.
+        """
+        before, present = self._built_in_before, self._built_in
+        changed = [name for name in before if present.get(name) is not before[name]]
+        present.update(before)
+        sys.modules = self._loaded
+        for name in self._modules:
+            if self._loaded.get(name) is None:
+                self._loaded[name] = self._modules[name]
+        for present, before in self._others:
+            for name in before:
+                if is_callable(before[name]) and not is_callable(present.get(name)):
+                    present[name] = before[name]
+        if not changed:
+            return None
+        place = next((place for place, name in _changes() if name.startswith("builtins")), "")
+        return TaskError(
+            f"{place}code of the task has deleted or replaced the built-in functions {listing(changed, limit=3)}",
+            hint="remove the assignment to `builtins` from the task's code; --debug shows the traceback",
+        )
+
+
+def change_of_module(error: BaseException) -> TaskError | None:
+    """Return an error that names the line of a task's code that changes a module, the probable reason of `error`.
+
+    Return None if no executed file of a task or plugin has such a line.
+    """
+    for place, name in _changes():
+        return TaskError(
+            f"{place}code of the task changes {name}, which is probably the reason for {short_error(error)}",
+            hint="remove the change; if the error remains, report it with the traceback that --debug shows",
+        )
+    return None
+
+
+def _changes() -> Iterator[tuple[str, str]]:
+    """Yield `file:line: ` and dotted name of the changes of modules in the executed files of tasks and plugins."""
+    files = dict.fromkeys(executed_files())
+    for name, module in list(sys.modules.items()):
+        file = getattr(module, "__file__", None)
+        if isinstance(file, str) and is_task_file(file, name.partition(".")[0]):
+            files[file] = None
+    for file in files:
+        try:
+            source = Path(file).read_bytes()
+            tree = ast.parse(source) if len(source) <= _MAX_BYTES else ast.Module([], [])
+        except (OSError, ValueError, SyntaxError, RecursionError, MemoryError):
+            continue
+        for line, name in sorted(_changes_in(tree)):
+            yield f"{file}:{line}: ", name
+
+
+def _changes_in(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """Yield line and dotted name of assignments to names of modules that a file imports, and of their deletions.
+
+    Assignments of constants other than None are left out: they are settings, as in `torch.backends.cudnn.enabled`.
+    """
+    imported = {"__builtins__": "builtins"}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            for each in node.names:
+                top = each.name.partition(".")[0]
+                imported[each.asname or top] = each.name if each.asname else top
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            imported |= {each.asname or each.name: f"{node.module}.{each.name}" for each in node.names}
+    imported = {name: module for name, module in imported.items() if not _is_of_task(module.partition(".")[0])}
+    for node in ast.walk(tree):
+        for target in _changed_expressions(node):
+            root, inner = _dotted(target)
+            if root in imported and inner:
+                yield node.lineno, ".".join((imported[root], *inner))  # type: ignore[attr-defined]
+
+
+def _is_of_task(package: str) -> bool:
+    file = getattr(sys.modules.get(package), "__file__", None)
+    return isinstance(file, str) and is_task_file(file, package)
+
+
+def _changed_expressions(node: ast.AST) -> list[ast.expr]:
+    """Return the expressions `MODULE.NAME` that a statement or a call changes."""
+    match node:
+        case ast.Assign(value=ast.Constant(value=value)) if value is not None:
+            return []
+        case ast.Assign(targets=targets) | ast.Delete(targets=targets):
+            flat = [part for each in targets for part in (each.elts if isinstance(each, ast.Tuple) else [each])]
+            return [each for each in flat if not isinstance(each, ast.Subscript) or _is_namespace(each.value)]
+        case ast.Call(func=ast.Name(id="setattr" | "delattr"), args=[owner, ast.Constant(value=name), *_]):
+            return [ast.Attribute(owner, str(name))]
+        case ast.Call(func=ast.Name(id="setattr" | "delattr"), args=[owner, *_]):
+            return [ast.Attribute(owner, "...")]
+        case ast.Call(func=ast.Attribute(value=owner, attr=name)) if name in _CHANGING and _is_namespace(owner):
+            return [owner]
+    return []
+
+
+def _is_namespace(node: ast.expr) -> bool:
+    """Return whether an expression is the dictionary of a module's names, or `sys.modules`."""
+    match node:
+        case ast.Name(id="__builtins__") | ast.Attribute(attr="__dict__") | ast.Call(func=ast.Name(id="vars")):
+            return True
+        case ast.Attribute(value=ast.Name(id="sys"), attr="modules"):
+            return True
+    return False
+
+
+def _dotted(node: ast.expr) -> tuple[str, list[str]]:
+    """Return the name at the start of an expression and the attributes behind it: `a.b["c"]` -> a, [b]."""
+    match node:
+        case ast.Name(id=name):
+            return name, []
+        case ast.Attribute(value=owner, attr=attribute):
+            root, inner = _dotted(owner)
+            return root, [*inner, attribute]
+        case ast.Subscript(value=owner):
+            root, inner = _dotted(owner)
+            return root, inner or ["__dict__"]
+        case ast.Call(func=ast.Name(id="vars"), args=[owner]):
+            root, inner = _dotted(owner)
+            return root, [*inner, "__dict__"]
+    return "", []
