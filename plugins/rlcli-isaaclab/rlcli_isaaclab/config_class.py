@@ -18,18 +18,13 @@ T = TypeVar("T")
 def configclass(cls: type[T]) -> type[T]:
     """Turn a class into a dataclass: all names except methods and nested classes become fields."""
     own = inspect.get_annotations(cls)
-<<<<<<< HEAD
     inherited = {name for base in cls.__mro__[1:] for name in getattr(base, "__dataclass_fields__", ())}
     assigned = [
         name
         for name, value in vars(cls).items()
         if name in own or _is_setting(cls, name, value) or (name in inherited and inspect.isfunction(value))
     ]
-    if hasattr(cls, "__settings__"):  # a subclass of a class that takes any settings (sim.py)
-=======
-    assigned = [name for name, value in vars(cls).items() if name in own or _is_setting(cls, name, value)]
     if hasattr(cls, "__settings__"):  # a subclass of a class that accepts settings of any name (sim.py)
->>>>>>> voice2
         cls._fixed = {**cls._fixed, **{name: vars(cls)[name] for name in assigned}}  # type: ignore[attr-defined]
         return cls
     names = [*(name for name in own if name not in assigned), *assigned]
