@@ -35,8 +35,8 @@ class AttributeState:
     """Saver of an object's attributes, and of those of its helpers: attributes that are objects of the task's classes.
 
     Args:
-        owner: the object. Make the saver before the first step: values that differ later from those of now have
-            changed.
+        owner: the object. Make the saver before the first step: a value counts as changed if it differs from the value
+            at that time.
         excluded: names of attributes that are not saved.
     """
 

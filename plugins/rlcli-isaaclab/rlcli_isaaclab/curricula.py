@@ -82,8 +82,8 @@ class ChangedSetting:
         changed = set(self._numbers(_with_numbers_changed(self.start)).items()) - set(self._numbers(self.start).items())
         names = sorted(name for name, _ in changed)
         self.addresses = [(f"address_{index}", name) for index, name in enumerate(names)]
-        """Pairs of a parameter of the curriculum term and the address of a setting of rlcli, such as
-        `rewards.alive.weight`, that depends on the value."""
+        """Pairs: a parameter of the curriculum term, and the address of a setting of rlcli, such as
+        `rewards.alive.weight`, that changes with the value."""
 
     def translate(self, value: Any) -> list[Any]:
         """Return the values of rlcli's settings for a value of Isaac Lab's setting, in the order of `addresses`."""

@@ -53,7 +53,7 @@ class DirectRLEnv(gymnasium.Env):
 
         managed = MANAGED.get(None)
         if managed is None:
-            raise TaskError("a DirectRLEnv cannot be created by itself", hint="use `rlcli train`, or rlcli.make_env")
+            raise TaskError("a DirectRLEnv cannot be created by itself", hint="use `rlcli train`, or rlcli.api.make")
         if isinstance(managed, _Shell):
             for name, value in {"cfg": cfg, "sim": managed.sim, "scene": managed.scene, "managed": managed}.items():
                 self.__dict__[name] = value
