@@ -35,8 +35,8 @@ class AttributeState:
     """Saver of an object's attributes, and of those of its helpers: attributes that are objects of the task's classes.
 
     Args:
-        owner: the object. Make the saver before the first step: values that differ later from those of now have
-            changed.
+        owner: the object. Make the saver before the first step: a value counts as changed if it differs from the value
+            at that time.
         excluded: names of attributes that are not saved.
     """
 
@@ -154,7 +154,8 @@ class AttributeState:
             return
         if not (current is None or isinstance(current, Tensor | np.ndarray)):
             raise ValueError(
-                f"the saved value '{path}' is a tensor, but not in {type(self._owner).__name__}: restore its old code"
+                f"the saved value '{path}' is a tensor, but class {type(self._owner).__name__} has another value there;"
+                " restore the old code of the class"
             )
         if isinstance(container, dict):
             container[key] = value.clone()
@@ -162,7 +163,8 @@ class AttributeState:
             container[int(key) : int(key) + 1] = [value.clone()]
         else:
             raise ValueError(
-                f"the saved value '{path}' does not exist in {type(self._owner).__name__}: restore its old code"
+                f"class {type(self._owner).__name__} has no attribute for the saved value '{path}';"
+                " restore the old code of the class"
             )
 
 

@@ -117,7 +117,7 @@ class CommandManager(TensorState):
         """Set a column of a command in every environment, from the next step on.
 
         Args:
-            name: name of the column's knob.
+            name: name of the column, as in the `name` of its `Knob`.
             value: the value to hold; None: return to the values that the term draws.
 
         Raises:

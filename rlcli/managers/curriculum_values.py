@@ -67,7 +67,7 @@ class TunableValues:
                     f"a curriculum cannot change '{address}': {where} no setting '{key}' that may change", hint
                 )
             value = _member(value, key)
-            if _is_number(value):
+            if _is_numeric(value):
                 try:
                     return self._opened(path[: depth + 1], value)[tuple(int(index) for index in path[depth + 1 :])]
                 except (ValueError, IndexError):
@@ -97,11 +97,11 @@ def _member(value: Any, key: str) -> Any:
 
 def _may_change(value: object) -> bool:
     """Return whether a value is a number or contains one."""
-    return _is_number(value) or any(_may_change(_member(value, name)) for name in _names(value))
+    return _is_numeric(value) or any(_may_change(_member(value, name)) for name in _names(value))
 
 
-def _is_number(value: object) -> bool:
+def _is_numeric(value: object) -> bool:
     """Return whether a value is a number or a list of numbers."""
     if isinstance(value, list | tuple):
-        return bool(value) and all(_is_number(item) for item in value)
+        return bool(value) and all(_is_numeric(item) for item in value)
     return isinstance(value, int | float) and not isinstance(value, bool)

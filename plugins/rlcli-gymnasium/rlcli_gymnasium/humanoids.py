@@ -95,7 +95,7 @@ class Humanoid(_Humanoid):
         return within(self.field.qpos[:, 2], *self.params.healthy_z_range)
 
     def compute_reward(self) -> Tensor:
-        """Return speed and health, minus the cost of controls and contacts."""
+        """Return the reward: speed and a bonus for health, minus the costs of controls and contacts. (num_envs,)"""
         params = self.params
         gains = params.forward_reward_weight * self.speed() + ~self.ended * params.healthy_reward
         contact_cost = self.force_cost(params.contact_cost_weight, params.contact_cost_range)

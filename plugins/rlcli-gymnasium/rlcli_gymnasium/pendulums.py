@@ -34,7 +34,7 @@ class InvertedPendulum(GymnasiumTask):
         return [self.field.qpos, self.field.qvel]
 
     def compute_reward(self) -> Tensor:
-        """Return 1, or 0 if the pole fell."""
+        """Return the reward: 1, or 0 where the pole has fallen. (num_envs,)"""
         return ~self.ended
 
     def check_termination(self) -> None:

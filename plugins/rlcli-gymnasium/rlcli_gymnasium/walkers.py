@@ -66,7 +66,7 @@ class Ant(GymnasiumTask):
         return (height >= low) & (height <= high)
 
     def compute_reward(self) -> Tensor:
-        """Return speed and health, minus the cost of actions and contacts."""
+        """Return the reward: speed and a bonus for health, minus the costs of actions and contacts. (num_envs,)"""
         params = self.params
         gains = self.speed() * params.forward_reward_weight + ~self.ended * params.healthy_reward
         contact_cost = params.contact_cost_weight * square_sum(self.contact_forces())
@@ -105,7 +105,7 @@ class HalfCheetah(GymnasiumTask):
         return [self.field.qpos[:, 1:], self.field.qvel]
 
     def compute_reward(self) -> Tensor:
-        """Return speed, minus the cost of actions."""
+        """Return the reward: speed, minus the cost of actions. (num_envs,)"""
         params = self.params
         return params.forward_reward_weight * self.speed() - self.action_cost(params.ctrl_cost_weight)
 
@@ -175,7 +175,7 @@ class Walker2d(GymnasiumTask):
         return within(height, *self.params.healthy_z_range) & within(angle, *self.params.healthy_angle_range)
 
     def compute_reward(self) -> Tensor:
-        """Return speed and health, minus the cost of actions."""
+        """Return the reward: speed and a bonus for health, minus the cost of actions. (num_envs,)"""
         params = self.params
         gains = params.forward_reward_weight * self.speed() + ~self.ended * params.healthy_reward
         return gains - self.action_cost(params.ctrl_cost_weight)

@@ -109,7 +109,7 @@ def read_actuators(
     return joints, models
 
 
-_NO_SPEED_LIMIT = "terms read it; MuJoCo's joints have no speed limit"
+_NO_SPEED_LIMIT = "only terms read this value; MuJoCo's joints have no speed limit"
 
 
 def _read_implicit_limits(item: Node) -> dict[str, Any]:

@@ -163,7 +163,7 @@ def _read_skrl(top: Node) -> dict[str, Any]:
         "critic": critic,
         "init_std": math.exp(policy.get("initial_log_std", 0.0)),
     }
-    interval = agent.node("experiment").get("checkpoint_interval")  # in steps; "auto": ten in a training
+    interval = agent.node("experiment").get("checkpoint_interval")  # [steps]; "auto": ten checkpoints
     if isinstance(interval, int) and interval > 0:
         found["save_interval"] = math.ceil(interval / rollouts)
     if agent.get("value_clip"):
@@ -232,7 +232,7 @@ def _read_sb3(top: Node) -> dict[str, Any]:
         "critic": {"hidden": shapes["vf"], "activation": activation},
         "init_std": math.exp(policy.get("log_std_init", 0.0)),
     }
-    if isinstance(found["learning_rate"], str):  # `lin_3e-4`: it decreases over the training
+    if isinstance(found["learning_rate"], str):  # `lin_3e-4` falls linearly to 0
         found["learning_rate"], found["schedule"] = float(found["learning_rate"].removeprefix("lin_")), "linear"
     why = "SB3 scales rewards; rlcli's normalize_value normalises the critic's targets, so it is not set"
     top.note("ignored", "normalize_value", why)

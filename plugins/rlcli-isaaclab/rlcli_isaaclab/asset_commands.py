@@ -1,4 +1,4 @@
-"""Writes of a task to a robot or object: joint targets, forces on bodies, and calls of `root_physx_view`."""
+"""Adapters for what a task writes to a robot or object: joint targets, forces, and values of `root_physx_view`."""
 
 from __future__ import annotations
 

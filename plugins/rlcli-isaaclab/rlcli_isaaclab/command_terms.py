@@ -41,7 +41,7 @@ class _RobotCommand(CommandTerm):
 
 
 class UniformVelocityCommand(_RobotCommand):
-    """Velocity in the robot's frame from uniform distributions: x, y [m/s] and yaw [rad/s]."""
+    """Command of a velocity in the robot's frame, sampled uniformly: x, y [m/s] and yaw rate [rad/s]."""
 
     def __init__(self, cfg: Any, env: Any) -> None:
         super().__init__(cfg, env)
@@ -79,7 +79,7 @@ class UniformVelocityCommand(_RobotCommand):
 
 
 class NormalVelocityCommand(UniformVelocityCommand):
-    """Velocity in the robot's frame from normal distributions with random signs."""
+    """Command of a velocity in the robot's frame, sampled from normal distributions with random signs."""
 
     def __init__(self, cfg: Any, env: Any) -> None:
         super().__init__(cfg, env)
@@ -99,7 +99,7 @@ class NormalVelocityCommand(UniformVelocityCommand):
 
 
 class UniformPoseCommand(_RobotCommand):
-    """Pose of a body in the frame of the robot's root."""
+    """Command of a pose of a body, in the frame of the robot's root."""
 
     def __init__(self, cfg: Any, env: Any) -> None:
         super().__init__(cfg, env)
@@ -131,7 +131,7 @@ class UniformPoseCommand(_RobotCommand):
 
 
 class UniformPose2dCommand(_RobotCommand):
-    """Position and heading on the ground, in the robot's frame."""
+    """Command of a position and a heading on the ground, in the robot's frame."""
 
     def __init__(self, cfg: Any, env: Any) -> None:
         super().__init__(cfg, env)

@@ -75,15 +75,15 @@ class ChangedSetting:
             settings = settings[part]
         self._settings, self._read = settings, read
         self.start = _get(settings, self.path)
-        if not _is_number(self.start):
+        if not _is_numeric(self.start):
             raise KeyError(address)
         self.is_own = False
         """Whether the term runs the task's own code, which receives Isaac Lab's value instead of a translated one."""
-        changed = set(self._numbers(_moved(self.start)).items()) - set(self._numbers(self.start).items())
+        changed = set(self._numbers(_with_numbers_changed(self.start)).items()) - set(self._numbers(self.start).items())
         names = sorted(name for name, _ in changed)
         self.addresses = [(f"address_{index}", name) for index, name in enumerate(names)]
-        """Pairs of a parameter of the curriculum term and the address of a setting of rlcli, such as
-        `rewards.alive.weight`, that depends on the value."""
+        """Pairs: a parameter of the curriculum term, and the address of a setting of rlcli, such as
+        `rewards.alive.weight`, that changes with the value."""
 
     def translate(self, value: Any) -> list[Any]:
         """Return the values of rlcli's settings for a value of Isaac Lab's setting, in the order of `addresses`."""
@@ -118,7 +118,7 @@ def _flat(value: Any, path: str) -> Iterator[tuple[str, Any]]:
     if isinstance(value, Mapping):
         for name, item in value.items():
             yield from _flat(item, f"{path}.{name}")
-    elif _is_number(value):
+    elif _is_numeric(value):
         yield path, _as_tuple(value)
 
 
@@ -126,21 +126,21 @@ def _as_tuple(value: Any) -> Any:
     return tuple(map(_as_tuple, value)) if isinstance(value, list | tuple) else value
 
 
-def _is_number(value: Any) -> bool:
+def _is_numeric(value: Any) -> bool:
     """Return whether a value is a number, or a list of numbers."""
     if isinstance(value, list | tuple):
-        return bool(value) and all(map(_is_number, value))
+        return bool(value) and all(map(_is_numeric, value))
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def _moved(value: Any) -> Any:
+def _with_numbers_changed(value: Any) -> Any:
     """Return a setting with 1 added to each of its numbers.
 
     The class translates the term with the original and with this value: settings of rlcli that then differ depend on
     the setting.
     """
     if isinstance(value, list | tuple):
-        return type(value)(_moved(item) for item in value)
+        return type(value)(_with_numbers_changed(item) for item in value)
     return value + 1.0
 
 

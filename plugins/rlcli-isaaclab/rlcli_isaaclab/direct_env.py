@@ -27,7 +27,7 @@ from rlcli_isaaclab.config_class import MISSING, configclass, fill_missing
 from rlcli_isaaclab.own_fields import set_valid_fields
 from rlcli_isaaclab.setup_scene import Setup, running
 from rlcli_isaaclab.sim import SimulationCfg
-from rlcli_isaaclab.user_files import placed
+from rlcli_isaaclab.user_files import adapt_to_device
 
 MANAGED: ContextVar[Any] = ContextVar("managed")
 """Environment of rlcli that is now creating an object of the task's class."""
@@ -53,7 +53,7 @@ class DirectRLEnv(gymnasium.Env):
 
         managed = MANAGED.get(None)
         if managed is None:
-            raise TaskError("a DirectRLEnv cannot be created by itself", hint="use `rlcli train`, or rlcli.make_env")
+            raise TaskError("a DirectRLEnv cannot be created by itself", hint="use `rlcli train`, or rlcli.api.make")
         if isinstance(managed, _Shell):
             for name, value in {"cfg": cfg, "sim": managed.sim, "scene": managed.scene, "managed": managed}.items():
                 self.__dict__[name] = value
@@ -306,7 +306,7 @@ def record(env_class: type[DirectRLEnv], cfg: Any) -> tuple[Setup, Any]:
     setup = Setup()
     with running(setup), building(_Shell(cfg)):
         try:
-            placed(env_class, "cpu")(cfg)
+            adapt_to_device(env_class, "cpu")(cfg)
         except _Recorded as recorded:
             return setup, recorded.env
     raise TaskError(f"{env_class.__name__}.__init__ does not call super().__init__(cfg, ...)", hint="add the call")

@@ -21,7 +21,7 @@ from rlcli_isaaclab.direct_env import DirectRLEnv, building
 from rlcli_isaaclab.observation_noise import noise_model
 from rlcli_isaaclab.own_fields import set_own_fields
 from rlcli_isaaclab.substeps import Substeps
-from rlcli_isaaclab.user_files import placed
+from rlcli_isaaclab.user_files import adapt_to_device
 from rlcli_isaaclab.utils.buffers import call_without_effects
 
 
@@ -66,7 +66,7 @@ class DirectRunner:
         self.phase = "build"
         self._substeps = Substeps(managed, "direct task", self)
         with building(managed):
-            self.lab: DirectRLEnv = placed(term.env_class, managed.device)(cfg)
+            self.lab: DirectRLEnv = adapt_to_device(term.env_class, managed.device)(cfg)
         for asset in self.lab.scene.articulations.values():
             asset.start_wrenches(by_task=True)
         self.action_noise = noise_model(cfg.action_noise_model, managed)
@@ -205,7 +205,7 @@ class _Reward(_Hook):
         if self._runner.phase == "build":
             return torch.zeros(self._runner.managed.num_envs, device=self._runner.managed.device)
         reward = self._runner.lab._get_rewards().float()
-        is_column = reward.shape == (self._runner.managed.num_envs, 1)  # as Isaac Lab's libraries of agents accept it
+        is_column = reward.shape == (self._runner.managed.num_envs, 1)  # Isaac Lab's agent libraries accept it, too
         return reward[:, 0] if is_column else reward
 
 

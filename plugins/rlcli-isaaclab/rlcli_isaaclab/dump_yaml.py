@@ -97,7 +97,7 @@ class _Loader(strict_yaml.Loader):
         self._items, self._deepest = items, max(self._deepest, depth)
         if items > MAX_ITEMS:
             raise _error(f"the file has more than {MAX_ITEMS} items; make it smaller", mark)
-        if depth > MAX_DEPTH + 1:  # a value in MAX_DEPTH lists and mappings
+        if depth > MAX_DEPTH + 1:  # the deepest allowed value is inside MAX_DEPTH lists
             raise _error(f"values are nested deeper than {MAX_DEPTH} levels; write them flatter", mark)
 
     def _check(self, event: Any) -> None:

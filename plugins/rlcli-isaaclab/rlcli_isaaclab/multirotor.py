@@ -37,7 +37,7 @@ class Thruster:
         self.reset(slice(None))
 
     def reset(self, env_ids: Any) -> None:
-        """Draw the constants of the rotors, and set the rotors to their initial speed."""
+        """Sample time and thrust constants of the rotors in some environments, and set their initial speed."""
         cfg = self.cfg
         shape = self.tau_inc_s[env_ids].shape
         for target, ends in (

@@ -216,7 +216,7 @@ def _member(module: str, name: str) -> Any:
         home = _LIBRARY_NAMES[name]
         found = _lab_module(home) if home.startswith("isaaclab") else importlib.import_module(home)
         return getattr(found, name, found)
-    if path not in _modules() and name not in _definitions():  # a module that its package imports from further below
+    if path not in _modules() and name not in _definitions():  # the package re-exports a module of a subpackage
         below = (found for found in sorted(_modules()) if found.startswith(f"{module}.") and found.endswith(f".{name}"))
         path = next(below, path)
     for candidate in _homes(module):

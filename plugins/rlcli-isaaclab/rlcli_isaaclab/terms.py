@@ -27,10 +27,10 @@ from rlcli_isaaclab.settings import to_plain
 from rlcli_isaaclab.substeps import Substeps
 from rlcli_isaaclab.term_values import resolved, type_hints
 from rlcli_isaaclab.user_files import (
+    adapt_to_device,
     code_of,
     file_text,
     place_of_code,
-    placed,
     source_text,
     term_reads_body_forces,
     unset_simple,
@@ -387,7 +387,7 @@ def _bind_object(term: UserObject, env: Any, **params: Any) -> _BoundObject:
     if term.section == "commands":
         cfg.resampling_time_range = tuple(env.config.commands[term.name].resampling_time_s)
     with building(env):
-        made = placed(term.function, env.device)(cfg, facade)
+        made = adapt_to_device(term.function, env.device)(cfg, facade)
     made.rlcli_name = term.name
     return _BoundAction(made, env, term.name) if term.section == "actions" else _BoundCommand(made)
 
@@ -439,7 +439,8 @@ def _bind_term(term: UserTerm, env: Any, **params: Any) -> _Bound:
                 if isinstance(chosen, SceneEntityCfg) and isinstance(getattr(chosen, key), Tensor):
                     setattr(chosen, key, getattr(chosen, key).tolist())
     if not term.is_class:
-        return _Bound(placed(term.function, env.device), term.section, facade, values)
+        return _Bound(adapt_to_device(term.function, env.device), term.section, facade, values)
     with building(env):
-        made = placed(term.function, env.device)(cfg=ManagerTermBaseCfg(func=term.function, params=values), env=facade)
-    return _BoundClass(made, term.section, facade, values)
+        cfg = ManagerTermBaseCfg(func=term.function, params=values)
+        instance = adapt_to_device(term.function, env.device)(cfg=cfg, env=facade)
+    return _BoundClass(instance, term.section, facade, values)

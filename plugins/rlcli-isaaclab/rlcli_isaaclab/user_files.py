@@ -74,8 +74,8 @@ _BODY_FORCES = (
 )
 
 
-def placed(target: Any, device: Any) -> Any:
-    """Return a function or class of the user in a form that runs on `device`.
+def adapt_to_device(target: Any, device: Any) -> Any:
+    """Return a function or class of the user, adapted so that it runs on `device`.
 
     If the device is the CPU and the user's file contains `cuda`, the code is run with the CPU in place of `cuda`.
     Otherwise return the function or class unchanged.

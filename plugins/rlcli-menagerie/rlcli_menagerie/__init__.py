@@ -8,10 +8,10 @@ from rlcli.task import TaskSpec
 GO1 = TaskSpec(
     package=__name__,
     config="go1.yaml",
-    summary="Follow velocity commands with a Unitree Go1 (the model is the user's).",
+    summary="Follow velocity commands with a Unitree Go1 (you provide the model).",
 )
 G1 = TaskSpec(
     package=__name__,
     config="g1.yaml",
-    summary="Follow velocity commands with a Unitree G1 (the model is the user's).",
+    summary="Follow velocity commands with a Unitree G1 (you provide the model).",
 )

@@ -77,20 +77,20 @@ class ArticulationView(XFormPrimView):
 
     @property
     def body_names(self) -> list[str]:
-        """Body names, breadth first."""
+        """Names of the bodies, in breadth-first order."""
         return list(self._body_names)
 
     @property
     def num_joints(self) -> int:
-        """Number of joints between bodies."""
+        """Number of joints, counting fixed ones: one for each body but the root."""
         return self.num_bodies - 1
 
     def get_dof_index(self, dof_name: str) -> int:
-        """Return the column of a joint."""
+        """Return the index of a joint among the columns of the view."""
         return _look_up(self, dof_name, self._dof_indices, "joint")
 
     def get_body_index(self, body_name: str) -> int:
-        """Return the index of a body, breadth first; the root has index 0."""
+        """Return the index of a body in breadth-first order; the root has the index 0."""
         return _look_up(self, body_name, self._body_indices, "body")
 
     def get_joint_positions(self, indices: Any = None, joint_indices: Any = None, clone: bool = True) -> Tensor:
@@ -135,7 +135,7 @@ class ArticulationView(XFormPrimView):
         """Set efforts on the joints, limited by their motors. They hold until set again. (n, k) [N or N m]"""
         rows, columns, values = self._broadcast(efforts, indices, joint_indices)
         self._target("motor", self._efforts, rows, columns, values)
-        if len(self._without_motor):  # these joints have drives, not motors: the effort is added to the drive's
+        if len(self._without_motor):  # these joints have drives, not motors: the effort is added to that of the drive
             field = self.env.engine.field("qfrc_applied")
             dofs = self._dof_columns[self._without_motor]
             efforts = self._efforts[rows[:, None], self._without_motor]

@@ -103,7 +103,7 @@ class OigeEnv(DirectEnv):
                 task_class.__name__,
             )
         self.replicator.add_to(scene)
-        if self._mentions(_GRAVITY_METHODS):  # MuJoCo skips gravity compensation in a model without it
+        if self._mentions(_GRAVITY_METHODS):  # MuJoCo skips it if no body of the compiled model has it
             scene.spec.bodies[-1].gravcomp = scene.spec.bodies[-1].gravcomp or _TINY_GRAVITY_COMPENSATION
         scene.joints.add_motors()
         _set_ground_material(scene, self.block.get("sim", {}).get("default_physics_material") or {})

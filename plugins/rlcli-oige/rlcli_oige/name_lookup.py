@@ -59,7 +59,7 @@ def _search_folders(folder: Path) -> list[Path]:
     home = next((depth for depth, parent in enumerate(above) if any(map(_is_task, _yamls(parent)))), None)
     if home is not None:
         return above[: home + 1]
-    # without a YAML: the folder of views may lie beside the folder of tasks, so search the parent packages too
+    # no YAML was found: search the parent packages too, because the folder of views may lie beside that of tasks
     return [folder, *(parent for parent in above[1:3] if (parent / "__init__.py").is_file())]
 
 

@@ -22,12 +22,12 @@ _REMOVED = re.compile(r"\b(?:np|numpy)\.(?:Inf|Infinity|NaN|float_)\b")
 _modules: dict[str, ModuleType] = {}
 
 _IGNORED = {
-    "enable_extension": "rlcli has no extensions",
-    "PreviewSurface": "the model has the materials",
-    "VisualMaterial": "the model has the materials",
-    "OmniPBR": "the model has the materials",
-    "OmniGlass": "the model has the materials",
-    "DifferentialController": "tasks set the speeds of wheels themselves",
+    "enable_extension": "rlcli loads no extensions of Isaac Sim",
+    "PreviewSurface": "materials are part of the MJCF model",
+    "VisualMaterial": "materials are part of the MJCF model",
+    "OmniPBR": "materials are part of the MJCF model",
+    "OmniGlass": "materials are part of the MJCF model",
+    "DifferentialController": "rlcli has no wheel controller; the task must set the speeds of the wheels",
 }
 """Name of a class or function -> why its calls have no effect."""
 _REASONS = {

@@ -57,15 +57,15 @@ TOP_KEYS = (
 _DEVICE = "use --device"
 SIM_KEYS: Mapping[str, tuple[Status, str]] = {
     "use_gpu_pipeline": ("ignored", _DEVICE),
-    "use_fabric": ("ignored", "there is no USD stage"),
-    "use_flatcache": ("ignored", "there is no USD stage"),
+    "use_fabric": ("ignored", "rlcli has no USD stage"),
+    "use_flatcache": ("ignored", "rlcli has no USD stage"),
     "enable_scene_query_support": ("ignored", "rays are always available"),
     "disable_contact_processing": ("ignored", "contacts are always processed"),
     "enable_cameras": ("task", ""),
     "replicate_physics": ("ignored", "every environment is simulated separately"),
     "rendering_dt": ("approximated", "videos have one frame per step, or fewer with sim.render_interval"),
     "substeps": ("approximated", "for more than 1, set a smaller sim.dt and a larger decimation"),
-    "default_material": ("ignored", "OmniIsaacGymEnvs does not read it either, but default_physics_material"),
+    "default_material": ("ignored", "OmniIsaacGymEnvs ignores this key, too, and reads default_physics_material"),
     "gravity_mag": ("task", ""),
     "disable_gravity": ("task", ""),
     "add_damping": ("task", ""),

@@ -229,7 +229,7 @@ class _Translator(YamlTranslator):
         randomization_yaml.check(block, self.problem, self.note)
 
     def _models(self, block: Any) -> dict[str, Any]:
-        """Return the key `mjcf` with each robot named by its path in an environment; report mistakes."""
+        """Return the content of the key `mjcf`: path of a robot in an environment -> its model. Report mistakes."""
         models: dict[str, Any] = {}
         for path, value in _mapping(block).items():
             at = ("mjcf", path)

@@ -146,7 +146,7 @@ class _Sdf:
     Path = str
 
     def __getattr__(self, name: str) -> Any:
-        return Ignored(f"Sdf.{name}", "there is no USD stage")
+        return Ignored(f"Sdf.{name}", "rlcli has no USD stage")
 
 
 class _Usd:
@@ -202,4 +202,4 @@ def missing(module: str, name: str, reason: str = "it belongs to Omniverse") -> 
 carb, Gf, Sdf, Usd = _Carb(), _Gf(), _Sdf(), _Usd()
 PhysxSchema, UsdGeom, UsdPhysics = SchemaModule("PhysxSchema"), SchemaModule("UsdGeom"), SchemaModule("UsdPhysics")
 UsdLux = Ignored("UsdLux", "scene.lights sets the lights")
-UsdShade = Ignored("UsdShade", "the model has the materials")
+UsdShade = Ignored("UsdShade", "materials are part of the MJCF model")

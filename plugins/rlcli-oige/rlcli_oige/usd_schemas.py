@@ -190,7 +190,7 @@ class Xformable(Schema):
 
 
 class Xform(Xformable):
-    """A frame."""
+    """Frame (coordinate system) on the stage."""
 
 
 class SchemaModule:

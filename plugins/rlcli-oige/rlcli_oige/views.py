@@ -353,7 +353,7 @@ class RigidPrimView(XFormPrimView):
         self._set_gravity_compensation(1.0, indices)
 
     def _set_gravity_compensation(self, compensation: float, indices: Any) -> None:
-        if not self.env.engine.model.ngravcomp:  # MuJoCo skips gravity compensation in a model without it
+        if not self.env.engine.model.ngravcomp:  # MuJoCo skips it if no body of the compiled model has it
             why = "the model was built without gravity compensation, because the task's file does not mention"
             hint = "move this call into the file of the task's class"
             raise TaskError(f"view '{self.name}': {why} disable_gravities", hint=hint)

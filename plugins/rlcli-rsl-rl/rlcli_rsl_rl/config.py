@@ -30,7 +30,7 @@ class PolicyConfig(StrictModel):
     init_noise_std: Positive = 1.0
     """Standard deviation of the untrained policy."""
     noise_std_type: Literal["scalar", "log"] = "scalar"
-    """scalar: train the standard deviation; log: train its logarithm."""
+    """Trained parameter: the standard deviation (scalar), or its logarithm (log)."""
     state_dependent_std: Literal[False] = False
     """Whether the standard deviation depends on the state; only false is supported."""
     actor_obs_normalization: bool | None = None
@@ -59,7 +59,7 @@ class DistributionConfig(StrictModel):
     init_std: Positive = 1.0
     """Standard deviation of the untrained policy."""
     std_type: Literal["scalar", "log"] = "scalar"
-    """scalar: train the standard deviation; log: train its logarithm."""
+    """Trained parameter: the standard deviation (scalar), or its logarithm (log)."""
     std_range: tuple[NotNegative, Positive] = (1e-6, 1e6)
     """Bounds of the standard deviation."""
     learn_std: bool = True

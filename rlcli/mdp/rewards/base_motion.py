@@ -160,7 +160,7 @@ class ProgressReward(EntityTerm, TensorState):
 
     def reset(self, selection: Selection) -> None:
         """Start new episodes at their start positions, which are written already."""
-        # from qpos: the derived positions are computed after all terms are reset
+        # read qpos, because derived positions are computed only after all terms are reset
         first, _ = self.entity.floating()
         position = selection.read(self.entity.engine.field("qpos"), slice(first, first + 2)).float()
         selection.write(self._position, position)
