@@ -27,9 +27,10 @@ def take_own_processing(node: Node) -> tuple[int, bool]:
 
     Noise acts after the modifiers, so that noise of the task takes all modifiers with it.
     """
-    noise, modifiers = node.data.get("noise"), node.data.get("modifiers") or []
-    kind = noise.get("class_type") if isinstance(noise, dict) else None
-    has_noise = isinstance(noise, dict) and is_own(kind if kind is not None else noise.get("func"))
+    found, modifiers = node.data.get("noise"), node.data.get("modifiers") or []
+    noise: dict[str, Any] = found if isinstance(found, dict) else {}
+    kind = noise.get("class_type")
+    has_noise = is_own(kind if kind is not None else noise.get("func"))
     if kind is not None and not has_noise:
         parts = (noise.get("noise_cfg"), noise.get("bias_noise_cfg"))
         has_noise = any(is_own(part.get("func")) for part in parts if isinstance(part, dict))
