@@ -65,7 +65,7 @@ class DifferentialIKController:
         if is_position:
             self.ee_pos_des = self._command.clone() if ee_pos is None or not is_relative else self._command + ee_pos
             self.ee_quat_des = ee_quat.clone()
-        else:
+        elif ee_pos is not None:
             self.ee_pos_des, self.ee_quat_des = apply_delta_pose(ee_pos, ee_quat, self._command)
 
     def compute(self, ee_pos: Tensor, ee_quat: Tensor, jacobian: Tensor, joint_pos: Tensor) -> Tensor:
