@@ -199,7 +199,8 @@ def write_page(rows: dict[str, Any], page: Path) -> None:
         if not row["agent"]:
             marks[-1] = "no agent"
         stops = row["stage"] < (row["last"] if row["agent"] else min(row["last"], STAGES.index("trains")))
-        reason = re.sub(r"/\S*/", "", row["reason"]).replace("|", ";")[:300] if stops else lost(row.get("lost", ()))
+        short = re.sub(r"[^\s'\"]*/(?=\w)", "", row["reason"]).replace("|", ";")[:300]  # names of files only
+        reason = short if stops else lost(row.get("lost", ()))
         lines[name] = f"| `{name}` | {' | '.join(marks)} | {reason} |"
     before, after = text.partition(start)[0], text.partition(end)[2]
     ordered = [*head, *(lines[name] for name in sorted(lines))]
@@ -297,7 +298,8 @@ def row_of(name: str, kwargs: dict[str, Any], *arguments: Any) -> tuple[str, dic
 
 def count(rows: dict[str, Any]) -> None:
     """Print how many tasks pass each stage, and the messages that do not help."""
-    for message in faulty_messages({task: row["reason"] for task, row in rows.items()}):
+    reasons = {task: row["reason"] for task, row in rows.items() if row["reason"] != "no agent"}
+    for message in faulty_messages(reasons):
         print(f"faulty message: {message}")
     for direct in (False, True):
         kind = [row for row in rows.values() if row["direct"] == direct]
