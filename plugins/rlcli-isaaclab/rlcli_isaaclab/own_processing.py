@@ -9,6 +9,7 @@ import importlib
 from collections.abc import Callable
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from rlcli.config.term_signatures import Signature, builtin_terms
@@ -122,7 +123,7 @@ class _BoundProcessed:
         elif self._noise is not None:
             value = self._noise.func(value, self._noise)
         if is_first:  # rlcli calls a term before the first reset, to find its shape
-            self._reset(None)
+            self._reset(torch.arange(self._managed.num_envs, device=self._managed.device))
         return value
 
     def _create(self, shape: tuple[int, ...]) -> None:
