@@ -87,10 +87,8 @@ class Data:
         found = torch.zeros(self._env.num_envs, len(self.joint_names), device=self._env.device)
         if column == 2:
             found += engine.expand("dof_damping")[:, entity.dof_columns].float()
-        pairs = (*entity.actuators_of("position"), *entity.actuators_of("velocity"))
-        bias = engine.expand("actuator_biasprm") if pairs else None
-        for joint, actuator in pairs:
-            found[:, joint] -= bias[:, actuator, column].float()
+        for joint, actuator in (*entity.actuators_of("position"), *entity.actuators_of("velocity")):
+            found[:, joint] -= engine.expand("actuator_biasprm")[:, actuator, column].float()
         for actuators in entity.actuators:
             found[:, actuators.joints] = actuators.stiffness if column == 1 else actuators.damping
         return found

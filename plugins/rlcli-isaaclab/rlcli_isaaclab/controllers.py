@@ -60,15 +60,16 @@ class DifferentialIKController:
         """Set the wanted pose, or its difference from the present pose of the body. (num_envs, action_dim)"""
         self._command[:] = command
         is_relative, is_position = self.cfg.use_relative_mode, self.cfg.command_type == "position"
-        if (is_relative and ee_pos is None) or ((is_relative or is_position) and ee_quat is None):
+        if not is_relative and not is_position:
+            self.ee_pos_des, self.ee_quat_des = self._command[:, :3], self._command[:, 3:]
+            return
+        if ee_quat is None or (is_relative and ee_pos is None):
             raise ValueError("set_command of a relative command or a position needs the present pose of the body")
         if is_position:
-            self.ee_pos_des[:] = self._command + ee_pos if is_relative else self._command
-            self.ee_quat_des[:] = ee_quat
-        elif is_relative:
+            self.ee_pos_des = self._command.clone() if ee_pos is None or not is_relative else self._command + ee_pos
+            self.ee_quat_des = ee_quat.clone()
+        elif ee_pos is not None:
             self.ee_pos_des, self.ee_quat_des = apply_delta_pose(ee_pos, ee_quat, self._command)
-        else:
-            self.ee_pos_des, self.ee_quat_des = self._command[:, :3], self._command[:, 3:]
 
     def compute(self, ee_pos: Tensor, ee_quat: Tensor, jacobian: Tensor, joint_pos: Tensor) -> Tensor:
         """Return the joint positions for the command.

@@ -9,6 +9,7 @@ import importlib
 from collections.abc import Callable
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from rlcli.config.term_signatures import Signature, builtin_terms
@@ -27,9 +28,10 @@ def take_own_processing(node: Node) -> tuple[int, bool]:
 
     Noise acts after the modifiers, so that noise of the task takes all modifiers with it.
     """
-    noise, modifiers = node.data.get("noise"), node.data.get("modifiers") or []
-    kind = noise.get("class_type") if isinstance(noise, dict) else None
-    has_noise = isinstance(noise, dict) and is_own(kind if kind is not None else noise.get("func"))
+    found, modifiers = node.data.get("noise"), node.data.get("modifiers") or []
+    noise: dict[str, Any] = found if isinstance(found, dict) else {}
+    kind = noise.get("class_type")
+    has_noise = is_own(kind if kind is not None else noise.get("func"))
     if kind is not None and not has_noise:
         parts = (noise.get("noise_cfg"), noise.get("bias_noise_cfg"))
         has_noise = any(is_own(part.get("func")) for part in parts if isinstance(part, dict))
@@ -121,7 +123,7 @@ class _BoundProcessed:
         elif self._noise is not None:
             value = self._noise.func(value, self._noise)
         if is_first:  # rlcli calls a term before the first reset, to find its shape
-            self._reset(None)
+            self._reset(torch.arange(self._managed.num_envs, device=self._managed.device))
         return value
 
     def _create(self, shape: tuple[int, ...]) -> None:

@@ -618,6 +618,10 @@ def test_every_term_called_the_same_has_a_formula(section):
     assert called(section, "same") - ELSEWHERE <= set(FORMULAS[section])
 
 
+def test_terms_of_other_sections_are_not_called_the_same():
+    assert {section for section in tables() if called(section, "same")} <= {*FORMULAS, "events"}
+
+
 @pytest.mark.parametrize(("section", "name"), [(section, name) for section in FORMULAS for name in FORMULAS[section]])
 def test_term_has_the_value_of_its_formula(compared, section, name):
     found, expected = (np.asarray(values, dtype=float) for values in compared[section][name])

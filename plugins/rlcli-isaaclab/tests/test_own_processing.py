@@ -56,7 +56,7 @@ class Walk(NoiseModel):
         self.walk = torch.zeros(num_envs, 1, device=device)
 
     def reset(self, env_ids=None):
-        self.walk[slice(None) if env_ids is None else env_ids] = 0.0
+        self.walk[env_ids] = torch.zeros(len(env_ids), 1)  # always with ids, as in Isaac Lab
 
     def __call__(self, data):
         self.walk += 1.0

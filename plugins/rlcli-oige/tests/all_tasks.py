@@ -23,7 +23,7 @@ from pathlib import Path
 import stand_ins
 
 sys.path.insert(0, str(Path(__file__).parents[3] / "tests"))
-from support.task_lists import add_result, read_results, results_of
+from support.task_lists import add_result, faulty_messages, read_results, results_of
 
 NUM_ENVS, STEPS, ITERATIONS = 16, 200, 3
 START, END = "<!-- table of all tasks: plugins/rlcli-oige/tests/all_tasks.py -->", "<!-- end of the table -->"
@@ -157,6 +157,8 @@ def main(words: list[str]) -> None:
             rows.append(row)
             print(json.dumps(row), flush=True)
             add_result(options.out, row)
+    for message in faulty_messages({row["task"]: row["reason"] for row in rows}):
+        print(f"faulty message: {message}")
     page = options.page
     if page is not None:
         before, _, rest = page.read_text(encoding="utf-8").partition(START)
