@@ -69,7 +69,7 @@ def _digest(model: mujoco.MjModel, numbers: NDArray[np.float64]) -> bytes:
     """Return a digest of a compiled model, meshes and names included, and of an array."""
     content = np.zeros(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, content)
-    return hashlib.blake2b(numbers.tobytes(), key=hashlib.blake2b(content).digest()).digest()
+    return hashlib.blake2b(numbers.tobytes(), key=hashlib.blake2b(content.tobytes()).digest()).digest()
 
 
 def random_poses(

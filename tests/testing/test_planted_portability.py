@@ -301,6 +301,17 @@ def test_speed_finds_python_loop_with_its_line(where, direct):
     assert "steps/s" in notes["speed"]
 
 
+def test_speed_measures_few_steps_of_a_task_with_long_steps(direct, tmp_path):
+    count = tmp_path / "steps"
+    begin = "    def get_observations(self):\n"
+    planted = f"        import time\n        time.sleep(0.4)\n        with open({str(count)!r}, 'a') as file:\n"
+    planted += "            file.write('x')\n"
+    direct.replace(begin, begin + planted)
+    _, notes = only(direct, "speed")
+    assert len(count.read_text()) < 20  # 30 with ten measured steps of 16 and of 256 environments
+    assert "steps/s" in notes["speed"]
+
+
 def test_speed_restores_trace_function(managed):
     import sys
 
