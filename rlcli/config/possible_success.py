@@ -8,18 +8,20 @@ from rlcli.config.schema import TaskConfig
 from rlcli.errors import Problem
 
 
-def impossible_conditions(task: TaskConfig, layers: Layers) -> Iterator[Problem]:
+def impossible_conditions(task: TaskConfig, layers: Layers, *, is_run: bool) -> Iterator[Problem]:
     """Yield a problem for each condition of success that no episode can meet.
 
-    An episode that an override or a flag has shortened, for a quick trial, may be shorter than `hold_s`.
+    An episode that an override, a flag or a --config file has shortened, for a quick trial, may be shorter than
+    `hold_s`, also in the run that records the trial.
 
     Args:
         task: the validated task.
         layers: the sources of its values.
+        is_run: whether the configuration is the record of a run.
     """
     length_s = task.max_episode_length * task.step_dt
     origin = layers.origin(("episode_length_s",))
-    is_trial = origin is not None and origin.layer in ("override", "flag")
+    is_trial = is_run or (origin is not None and origin.layer in ("override", "flag", "config"))
     for name, condition in task.success.items():
         if condition is None:
             continue

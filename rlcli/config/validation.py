@@ -333,7 +333,7 @@ class TaskCheck:
         if self.problems or not isinstance(task, TaskConfig):
             return None
         task = with_terms(task, terms, params)
-        self.add(*impossible_conditions(task, self.layers))
+        self.add(*impossible_conditions(task, self.layers, is_run=self.source.config.name == "config.yaml"))
         return task
 
     def _validate(self, model: type[BaseModel], data: Any, at: Path) -> BaseModel | None:

@@ -142,21 +142,29 @@ def contain_side_effects() -> Iterator[None]:
     which rlcli's own tensors depend; and built-in functions that were deleted or replaced by a value.
     """
     built_in = _BUILT_IN.copy()
-    folder = _current_folder()
     settings = _torch_settings() or _TORCH_DEFAULTS
     with contextlib.suppress(OSError, ValueError):  # stdout is closed
         if sys.__stdout__ is not None:
             sys.__stdout__.flush()
-    with contextlib.redirect_stdout(sys.stderr), descriptor_redirected(1, 2):
+    with contextlib.redirect_stdout(sys.stderr), descriptor_redirected(1, 2), current_folder_kept():
         try:
             yield
         finally:
             _restore_built_in(built_in)
-            if folder is not None and _current_folder() != folder:
-                os.chdir(folder)
             changed = _torch_settings() or settings
             if changed != settings:
                 _restore_torch(settings, changed)
+
+
+@contextlib.contextmanager
+def current_folder_kept() -> Iterator[None]:
+    """Undo changes of the current folder after the `with` block: the user's relative paths depend on it."""
+    folder = _current_folder()
+    try:
+        yield
+    finally:
+        if folder is not None and _current_folder() != folder:
+            os.chdir(folder)
 
 
 _BUILT_IN = builtins.__dict__

@@ -228,7 +228,8 @@ def exit_refused() -> Iterator[None]:
     """Make `os._exit` and `os.abort` errors in the `with` block: a plugin would end the command without a message.
 
     Other processes, such as children that a library forks, still end. Another thread ends the command, with a message
-    if it runs code of a task.
+    if it runs code of a task. A task that calls `os.fork` itself also gets an error: the child would return from the
+    task's code, and continue the command a second time.
     """
     process, thread = os.getpid(), threading.get_ident()
 
@@ -247,11 +248,23 @@ def exit_refused() -> Iterator[None]:
 
         return refuse
 
+    def fork_refused(name: str, before: Callable[[], Any]) -> Callable[[], Any]:
+        def fork() -> Any:
+            frame = sys._getframe(1)
+            if frame.f_back is not None and _module(frame) == "pty":
+                frame = frame.f_back
+            if is_task_code(frame):
+                raise RuntimeError(f"os.{name} would continue the command in two processes; use subprocess instead")
+            return before()
+
+        return fork
+
     end = os._exit
     owners = [os, sys.modules[os.name]]  # `os` has the functions of the module `posix` or `nt`
-    functions = [(owner, name, getattr(owner, name)) for owner in owners for name in ("_exit", "abort")]
+    wrappers = {"_exit": refused, "abort": refused, "fork": fork_refused, "forkpty": fork_refused}
+    functions = [(owner, name, getattr(owner, name)) for owner in owners for name in wrappers if hasattr(owner, name)]
     for owner, name, before in functions:
-        setattr(owner, name, refused(name, before))
+        setattr(owner, name, wrappers[name](name, before))
     try:
         yield
     finally:

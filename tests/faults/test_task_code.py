@@ -168,6 +168,8 @@ ERRORS = {
     "os._exit(7)": "SystemExit: it called os._exit(7)",
     "exec('import posix; posix._exit(7)')": "SystemExit: it called os._exit(7)",
     "os.abort()": "SystemExit: it called os.abort()",
+    "os.fork()": "RuntimeError: os.fork would continue the command in two processes",
+    "__import__('pty').fork()": "RuntimeError: os.forkpty would continue the command in two processes",
     "exec('import typer; raise typer.Exit(0)')": "Exit: 0",
     "exec('import typer; raise typer.Abort')": "Abort",
 }
@@ -307,3 +309,11 @@ def test_task_that_changes_the_current_folder_is_trained(with_code, start, tmp_p
     assert out == f"{run}\n"
     assert f"run {run}\n" in err
     assert json.loads((run / "run.json").read_text())["state"] == "finished"
+
+
+def test_recording_in_a_relative_path_is_written_if_a_hook_changes_the_current_folder(with_code, start):
+    with_code("reset_idx", "os.chdir('/')")
+    process = start(*EVAL, "--record", "episodes.npz")
+    _, err = process.communicate()
+    assert process.returncode == 0, err
+    assert Path("episodes.npz").is_file()

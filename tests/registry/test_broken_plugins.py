@@ -1,6 +1,7 @@
 """A broken plugin affects only its own row; everything else works as without it."""
 
 import json
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -301,9 +302,9 @@ def test_format_plugin_that_ends_the_process_is_named(plugins, command, tmp_path
 
 def test_children_and_threads_may_end_while_a_command_runs():
     with exit_refused():
-        child = os.fork()
-        if child == 0:
-            os._exit(7)
-        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7
+        child = multiprocessing.get_context("fork").Process(target=os._exit, args=(7,))
+        child.start()
+        child.join()
+        assert child.exitcode == 7
         with pytest.raises(SystemExit, match=r"it called os\._exit\(3\)"):
             os._exit(3)
