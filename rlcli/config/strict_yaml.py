@@ -170,7 +170,8 @@ def _checked_events(text: str) -> Iterator[events.Event]:
         if getattr(event, "anchor", None):
             raise YamlError("anchors and aliases are not allowed; write the value again", event.start_mark)
         if getattr(event, "tag", None) not in (None, "!"):
-            raise YamlError(f"tags are not allowed; remove {str(event.tag)[:60]}", event.start_mark)
+            tag = str(event.tag).replace("tag:yaml.org,2002:", "!!")[:60]  # as the file has it
+            raise YamlError(f"tags are not allowed; remove {tag}", event.start_mark)
         documents += isinstance(event, events.DocumentStartEvent)
         if documents > 1:
             raise YamlError("only one document per file is allowed; remove the line `---`", event.start_mark)

@@ -181,9 +181,11 @@ def signature_of(term: Any, name: str) -> Signature:
         found = "a class without __init__" if is_class else f"an object of type {type(term).__name__}"
         allowed = "a function (env, *, ...), or a class whose __init__ takes (self, env, *, ...)"
         raise SignatureError(f"found {found}; a term is {allowed}")
-    if not _takes_env(call.args, 1 if isinstance(node, ast.ClassDef) else 0):
+    is_class = isinstance(node, ast.ClassDef)
+    if not _takes_env(call.args, 1 if is_class else 0):
         found = ", ".join(argument.arg for argument in call.args.args) or "no parameters"
-        raise SignatureError(f"the first parameter of a term must be 'env', found ({found}); write (env, *, ...)")
+        first, allowed = ("of __init__ after 'self'", "self, env") if is_class else ("of a term", "env")
+        raise SignatureError(f"the first parameter {first} must be 'env', found ({found}); write ({allowed}, *, ...)")
     return replace(_signature(node, call, name, Path(file or "?")), target=term)
 
 

@@ -113,7 +113,7 @@ def evaluate(
     on_step: Callable[[StepResult], None] = lambda _: None,
     groups: int = 1,
 ) -> Evaluation:
-    """Run exactly `episodes` episodes with a policy, and return their results.
+    """Run exactly `episodes` episodes in each group of environments with a policy, and return their results.
 
     Each environment runs a fixed number of episodes. Counting the first episodes that finish in any environment would
     favour short episodes.

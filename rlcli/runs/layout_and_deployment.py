@@ -60,7 +60,9 @@ def check_formula(value: Any) -> None:
         return
     own = {"b", "a", "key"} if value.get("op") == "filter" else set()
     if keys != {"op", "of"} | own or not isinstance(value["op"], str) or value["op"] not in OPS:
-        raise ValueError(f"{str(value)[:60]} is no formula of this rlcli version; use another checkpoint")
+        raise ValueError(
+            f"the manifest has an operation that this rlcli version does not know: {str(value)[:60]}; {_DAMAGED}"
+        )
     count, of = OPS[value["op"]], value["of"]
     if not isinstance(of, list) or (count is not None and len(of) != count) or not of:
         raise ValueError(f"operation '{value['op']}' takes {count or 'one or more'} operands; {_DAMAGED}")

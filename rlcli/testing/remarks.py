@@ -15,6 +15,7 @@ class Remark:
     rule: str
     """Name of the rule."""
     severity: Literal["error", "warning"]
+    """error: `rlcli lint` ends with exit code 9; warning: it does not, except with `--strict`."""
     where: str
     """Term, column or setting."""
     message: str
@@ -29,7 +30,7 @@ class Remark:
         return f"{self.severity}: {self.rule}: {self.where}: {self.message}; {self.hint}"
 
     def record(self) -> dict[str, Any]:
-        """Return the remark as JSON, which has no infinity: such numbers become null."""
+        """Return the remark as a dictionary for JSON; infinite and NaN numbers become None."""
         numbers = {name: value if math.isfinite(value) else None for name, value in self.numbers.items()}
         return {**asdict(self), "numbers": numbers}
 

@@ -102,14 +102,13 @@ def dtypes(subject: TaskUnderTest) -> Iterable[Finding]:
 def _check_outputs(
     subject: TaskUnderTest, check: Callable[[str, Tensor, tuple[int, ...]], Iterator[Finding]]
 ) -> list[Finding]:
-    """Return the findings about the tensors that the task returns, or else about the outputs of a step.
+    """Check the tensors that the task's own code returns; only if these are right, check the result of a step too.
 
-    A step's outputs are checked only if the task's own tensors are right, because a defect of these causes another in
-    the step.
+    A wrong tensor of the task would be found a second time in the result of the step.
 
     Args:
         subject: the task.
-        check: function from the name of an output, its tensor and the expected shape to findings.
+        check: called with the name of a tensor, the tensor and its expected shape; yields findings.
     """
     recording = subject.recording()
     layout = recording.env.layout

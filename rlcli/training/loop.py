@@ -82,7 +82,7 @@ class TrainLoop:
     _saved_at: float = field(init=False, default_factory=time.monotonic)
 
     def train(self, budget: Budget) -> None:
-        """Train until the budget is spent.
+        """Train until the budget is spent, the threshold of `--until` is reached or the deadline has passed.
 
         Raises:
             Stopped: on a signal, after a checkpoint between two iterations is written; on a second signal at once.

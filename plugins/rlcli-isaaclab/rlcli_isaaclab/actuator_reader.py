@@ -47,7 +47,7 @@ def read_actuators(
     for group, item in actuators.nodes():
         kind = kind_of(item.get("class_type"))
         if "thruster_names_expr" in item:
-            item.skip(*item.data)
+            item.mark_mapped(*item.data)
             continue
         patterns = item.require("joint_names_expr") or [".*"]
         patterns = [patterns] if isinstance(patterns, str) else list(patterns)
@@ -64,7 +64,7 @@ def read_actuators(
             settings = {**gains, **passive, **_read_implicit_limits(item)}
         elif is_user_actuator(item.data.get("class_type")):
             own[entity, group] = item.data
-            item.skip(*item.data)
+            item.mark_mapped(*item.data)
             if item.data["class_type"].is_implicit_model:
                 why = "rlcli computes efforts before each physics step; PhysX integrates the drive implicitly"
                 item.note("approximated", "class_type", why)
@@ -84,7 +84,7 @@ def read_actuators(
             if kind in _NETWORKS:
                 gains = {key: replaced[group].get(key, 0.0) for key in gains}
                 item.note("approximated", "network_file", "replaced by a PD controller with the gains of models.yaml")
-                item.skip("pos_scale", "vel_scale", "torque_scale", "input_order", "input_idx")
+                item.mark_mapped("pos_scale", "vel_scale", "torque_scale", "input_order", "input_idx")
                 kind = "DCMotor"
             elif kind == "RemotizedPDActuator":
                 table = item.get("joint_parameter_lookup")

@@ -100,7 +100,7 @@ class _ReportSink:
 def _read_rl_games(top: Node) -> dict[str, Any]:
     sink = _ReportSink(top.report)
     RlGamesReader(sink, is_strict=False).read(top.data.get("params"))
-    top.skip("pbt")
+    top.mark_mapped("pbt")
     return sink.data
 
 
@@ -171,12 +171,12 @@ def _read_skrl(top: Node) -> dict[str, Any]:
     if cnn:
         found["cnn"] = cnn
     _mark_false(agent, "time_limit_bootstrap", "rlcli always bootstraps at a time-out")
-    agent.skip("state_preprocessor_kwargs", "value_preprocessor_kwargs", "random_timesteps", "learning_starts")
-    agent.skip("kl_threshold", "experiment", "mixed_precision", "learning_rate_scheduler_kwargs")
+    agent.mark_mapped("state_preprocessor_kwargs", "value_preprocessor_kwargs", "random_timesteps", "learning_starts")
+    agent.mark_mapped("kl_threshold", "experiment", "mixed_precision", "learning_rate_scheduler_kwargs")
     for model in (policy, value):
-        model.skip("class", "clip_actions", "clip_log_std", "min_log_std", "max_log_std", "output", "network")
-    top.skip("seed", "memory", "trainer")
-    models.skip("separate")
+        model.mark_mapped("class", "clip_actions", "clip_log_std", "min_log_std", "max_log_std", "output", "network")
+    top.mark_mapped("seed", "memory", "trainer")
+    models.mark_mapped("separate")
     _mark_false(models, "separate", _SEPARATE)
     return found
 
@@ -239,8 +239,8 @@ def _read_sb3(top: Node) -> dict[str, Any]:
     for key in ("clip_obs", "target_kl", "squash_output"):
         top.note("ignored", key, "rlcli's ppo has no such setting")
     policy.note("ignored", "squash_output", "actions are not squashed")
-    policy.skip("ortho_init")
-    top.skip("seed", "device", "policy_kwargs")
+    policy.mark_mapped("ortho_init")
+    top.mark_mapped("seed", "device", "policy_kwargs")
     return found
 
 

@@ -69,8 +69,10 @@ def task(
             del config[section]
     if top.data.get("is_finite_horizon"):
         top.note("ignored", "is_finite_horizon", "rlcli always bootstraps at a time-out")
-    top.skip("ui_window_class_type", "wait_for_textures", "rerender_on_reset", "export_io_descriptors", "log_dir")
-    top.skip("num_rerenders_on_reset", "recorders", "teleop_devices", "xr", "is_finite_horizon")
+    top.mark_mapped(
+        "ui_window_class_type", "wait_for_textures", "rerender_on_reset", "export_io_descriptors", "log_dir"
+    )
+    top.mark_mapped("num_rerenders_on_reset", "recorders", "teleop_devices", "xr", "is_finite_horizon")
     if "seed" in top:
         top.note("ignored", "seed", "set the seed on the command line: --seed N")
     report.stubs = terms.stubs
@@ -172,8 +174,8 @@ def agent(data: Mapping[str, Any], report: Report) -> dict[str, Any]:
         symmetry.note("approximated", "data_augmentation_func", how)
     if str(algorithm.get("optimizer", "adam")).lower() != "adam":
         algorithm.note("ignored", "optimizer", "rlcli's ppo uses Adam")
-    algorithm.skip("class_name", "desired_kl")
-    top.skip(
+    algorithm.mark_mapped("class_name", "desired_kl")
+    top.mark_mapped(
         "obs_groups",
         "class_name",
         "logger",
@@ -191,7 +193,7 @@ def agent(data: Mapping[str, Any], report: Report) -> dict[str, Any]:
     ):
         default = {"seed": 42, "device": "cuda:0"}.get(name)
         if top.data.get(name) == default:
-            top.skip(name)
+            top.mark_mapped(name)
         elif top.data.get(name):
             top.note("ignored", name, f"use the option {option} of rlcli")
     report.finish(data)
@@ -240,15 +242,17 @@ def _sim(node: Node) -> dict[str, Any]:
     gravity = [as_float(g) for g in node.get("gravity", (0.0, 0.0, -9.81))]
     if gravity != [0.0, 0.0, -9.81]:
         config["gravity"] = gravity
-    node.skip("physics_prim_path", "use_fabric", "enable_scene_query_support", "render", "create_stage_in_memory")
-    node.skip("logging_level", "save_logs_to_file", "log_dir")
+    node.mark_mapped(
+        "physics_prim_path", "use_fabric", "enable_scene_query_support", "render", "create_stage_in_memory"
+    )
+    node.mark_mapped("logging_level", "save_logs_to_file", "log_dir")
     if "device" in node:
-        node.skip("device")
+        node.mark_mapped("device")
     material = node.data.get("physics_material")
     if isinstance(material, Mapping) and material:
         plain = material.get("static_friction", 0.5) == 0.5 and material.get("dynamic_friction", 0.5) == 0.5
         if plain:
-            node.skip("physics_material")
+            node.mark_mapped("physics_material")
         else:
             text = "the MJCF sets the friction of bodies; scene.ground.friction sets the friction of the ground"
             node.note("ignored", "physics_material", text)
@@ -266,7 +270,7 @@ def _viewer(node: Node) -> dict[str, Any]:
     resolution = node.get("resolution", (1280, 720))
     if tuple(resolution) != (1280, 720):
         config["width"], config["height"] = resolution
-    node.skip("cam_prim_path", "env_index", "asset_name", "body_name")
+    node.mark_mapped("cam_prim_path", "env_index", "asset_name", "body_name")
     if node.get("origin_type", "world") not in ("world", "env"):
         node.note("ignored", "origin_type", "the camera does not follow an asset")
     return config

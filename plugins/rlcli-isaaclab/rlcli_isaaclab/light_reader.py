@@ -16,9 +16,11 @@ def read_light(report: Report, item: Node, spawn: Node, lights: dict[str, Any]) 
         spawn: settings of its `spawn`.
         lights: kind of light -> settings in the task; the light is added here.
     """
-    item.skip("prim_path", "collision_group", "debug_vis", "class_type")
-    spawn.skip("func", "prim_type", "visible", "semantic_tags", "copy_from_source", "normalize", "exposure")
-    spawn.skip("enable_color_temperature", "color_temperature", "texture_format", "visible_in_primary_ray", "angle")
+    item.mark_mapped("prim_path", "collision_group", "debug_vis", "class_type")
+    spawn.mark_mapped("func", "prim_type", "visible", "semantic_tags", "copy_from_source", "normalize", "exposure")
+    spawn.mark_mapped(
+        "enable_color_temperature", "color_temperature", "texture_format", "visible_in_primary_ray", "angle"
+    )
     kind = {"DomeLight": "dome", "DistantLight": "distant"}.get(str(spawn.data.get("prim_type")))
     if kind is None:
         report.entries[item.key] = ("ignored", "only dome and distant lights have a counterpart")
@@ -30,7 +32,7 @@ def read_light(report: Report, item: Node, spawn: Node, lights: dict[str, Any]) 
     rotation = [as_float(v) for v in item.node("init_state").get("rot", (1.0, 0.0, 0.0, 0.0))]
     if kind == "distant":
         config["direction"] = _direction_of(rotation)
-    item.node("init_state").skip("pos", "rot")
+    item.node("init_state").mark_mapped("pos", "rot")
     if kind in lights:
         report.entries[item.key] = ("ignored", f"a scene has one {kind} light, and another light is used")
         return

@@ -62,7 +62,7 @@ class ObjectReader:
             reason, hint = reason_of(kind)
             self.report.problem(node.key, f"the action '{kind}' cannot be used: {reason}", hint)
             return {"func": "joint_effort"}
-        node.skip("debug_vis")
+        node.mark_mapped("debug_vis")
         entity = node.get("asset_name", "robot")
         config: dict[str, Any] = {"func": name, "entity": entity}
         preserve = bool(node.get("preserve_order", False))
@@ -97,7 +97,7 @@ class ObjectReader:
 
     def _read_ik_controller(self, node: Node) -> dict[str, Any]:
         """Return the settings of differential inverse kinematics."""
-        node.skip("class_type")
+        node.mark_mapped("class_type")
         config = {"mode": node.get("command_type", "pose"), "relative": bool(node.get("use_relative_mode", False))}
         if node.get("ik_method", "dls") != "dls":
             node.note("approximated", "ik_method", "replaced by damped least squares")

@@ -17,14 +17,14 @@ def read_processing(node: Node) -> dict[str, Any]:
         noise = node.node("noise")
         kind = kind_of(noise.get("class_type"))
         if kind:
-            noise.skip("sample_bias_per_component", "func")
+            noise.mark_mapped("sample_bias_per_component", "func")
             config["noise"] = _read_noise(noise.node("noise_cfg"))
             if "bias_noise_cfg" in noise:
                 config["bias"] = _read_noise(noise.node("bias_noise_cfg"))
         else:
             config["noise"] = _read_noise(noise)
     if "noise" not in node:
-        node.skip("noise")
+        node.mark_mapped("noise")
     clip, scale = node.get("clip"), node.get("scale")
     if clip is not None:
         config["clip"] = [as_float(v) for v in clip]
@@ -33,7 +33,7 @@ def read_processing(node: Node) -> dict[str, Any]:
     history = node.get("history_length", 0)
     if history:
         config["history"] = history
-    node.skip("flatten_history_dim")
+    node.mark_mapped("flatten_history_dim")
     return config
 
 
@@ -41,7 +41,7 @@ def _read_noise(node: Node) -> dict[str, Any]:
     """Return the settings of one noise: uniform, gaussian or constant."""
     operation = node.get("operation", "add")
     config: dict[str, Any] = {} if operation == "add" else {"operation": "set" if operation == "abs" else operation}
-    node.skip("func")
+    node.mark_mapped("func")
     if "n_min" in node.data:
         return {"kind": "uniform", "low": to_plain(node.get("n_min")), "high": to_plain(node.get("n_max")), **config}
     if "std" in node.data:

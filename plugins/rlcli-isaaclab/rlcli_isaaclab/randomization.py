@@ -100,7 +100,7 @@ class EventParameters:
         if value is not None and any(value if isinstance(value, list | tuple) else [value]):
             self.params.report.entries[(*self.params.key, name)] = ("ignored", why)
         else:
-            self.params.skip(name)
+            self.params.mark_mapped(name)
 
     def approximate(self, name: str, why: str) -> None:
         """Report that rlcli's parameter has nearly the same meaning; `why` is the difference."""
@@ -137,7 +137,7 @@ def _material(event: EventParameters) -> EventConfigs:
     if static != friction:
         event.approximate("static_friction_range", "MuJoCo has no static friction, only dynamic friction")
     event.ignore("restitution_range", "in MuJoCo, solref of a geom sets how contacts bounce")
-    event.params.skip("num_buckets", "make_consistent")
+    event.params.mark_mapped("num_buckets", "make_consistent")
     return {"": {**config, "range": friction if friction is not None else static, "operation": "set"}}
 
 
@@ -217,7 +217,7 @@ def _tendons(event: EventParameters) -> EventConfigs:
 def _scale(event: EventParameters) -> EventConfigs:
     value = event.require("scale_range")
     config: TermConfig = {"func": "randomize_geom_size", **event.entity(), "operation": "scale"}
-    event.params.skip("relative_child_path")
+    event.params.mark_mapped("relative_child_path")
     if isinstance(value, Mapping):
         return {"": {**config, "range": _axes("scale_range", value, 1.0)}}
     event.approximate("scale_range", "every axis of a shape samples its own scale")

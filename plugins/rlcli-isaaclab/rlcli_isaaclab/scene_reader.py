@@ -54,7 +54,7 @@ class SceneReader:
             "num_envs": node.get("num_envs", 1),
             "env_spacing": as_float(node.get("env_spacing", 4.0)),
         }
-        node.skip("lazy_sensor_update", "replicate_physics", "filter_collisions", "clone_in_fabric")
+        node.mark_mapped("lazy_sensor_update", "replicate_physics", "filter_collisions", "clone_in_fabric")
         ground: Any = None
         lights: dict[str, Any] = {}
         sensors: list[tuple[str, Node]] = []
@@ -276,9 +276,9 @@ class SceneReader:
         return new_name
 
     def _read_entity(self, name: str, item: Node, spawn: Node | None) -> None:
-        item.skip("class_type", "prim_path", "collision_group", "debug_vis", "articulation_root_prim_path")
-        item.skip("actuator_value_resolution_debug_print", "allocation_matrix", "rotor_directions")
-        item.skip("thruster_force_direction")  # Isaac Lab does not use it
+        item.mark_mapped("class_type", "prim_path", "collision_group", "debug_vis", "articulation_root_prim_path")
+        item.mark_mapped("actuator_value_resolution_debug_print", "allocation_matrix", "rotor_directions")
+        item.mark_mapped("thruster_force_direction")  # Isaac Lab does not use it
         prim = str(item.data.get("prim_path") or "")
         self.prims[name] = prim.rstrip("/").rsplit("/", 1)[-1]
         path = spawn.get("usd_path", spawn.get("asset_path")) if spawn else None
@@ -309,8 +309,8 @@ class SceneReader:
         except TaskError as error:
             self.report.problem((*spawn.key, "usd_path"), error.message, error.hint)
             return
-        spawn.skip("func", "visible", "copy_from_source", "activate_contact_sensors", "semantic_tags")
-        spawn.skip("visual_material_path", "variants")
+        spawn.mark_mapped("func", "visible", "copy_from_source", "activate_contact_sensors", "semantic_tags")
+        spawn.mark_mapped("visual_material_path", "variants")
         self._read_model(name, model)
         entity: dict[str, Any] = {"model": model, "velocity_point": "com"}
         init = item.node("init_state")
@@ -326,7 +326,7 @@ class SceneReader:
         factor = item.get("soft_joint_pos_limit_factor", 1.0)
         if factor != 1.0:
             entity["soft_joint_pos_limit_factor"] = as_float(factor)
-        init.skip("rps")  # of a Multirotor, which reads it and its actuators when it is created
+        init.mark_mapped("rps")  # of a Multirotor, which reads it and its actuators when it is created
         self._joint_settings[name], explicit = read_actuators(
             item.node("actuators"),
             lambda patterns, group: self.order_names(name, "joint", patterns, False, group.key),
@@ -363,8 +363,8 @@ class SceneReader:
         config["pos"] = [as_float(v) for v in init.get("pos", (0.0, 0.0, 0.0))]
         config["quat"] = [as_float(v) for v in init.get("rot", (1.0, 0.0, 0.0, 0.0))]
         self._read_root_velocity(config, init)
-        spawn.skip("func", "visible", "semantic_tags", "copy_from_source", "activate_contact_sensors", "axis")
-        spawn.skip("visual_material_path", "physics_material_path", "visual_material", "collision_props")
+        spawn.mark_mapped("func", "visible", "semantic_tags", "copy_from_source", "activate_contact_sensors", "axis")
+        spawn.mark_mapped("visual_material_path", "physics_material_path", "visual_material", "collision_props")
         return config
 
     def _read_model(self, name: str, model: str) -> None:

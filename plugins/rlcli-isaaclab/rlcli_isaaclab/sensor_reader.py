@@ -22,7 +22,7 @@ def read_sensor(kind: str, item: Node, prims: Mapping[str, str], frames: dict[st
         prims: entity -> the last part of its prim path.
         frames: receives the settings of frame transformers, which only the user's terms read.
     """
-    item.skip("class_type", "debug_vis", "visualizer_cfg", "track_pose", "max_contact_data_count_per_prim")
+    item.mark_mapped("class_type", "debug_vis", "visualizer_cfg", "track_pose", "max_contact_data_count_per_prim")
     prim = str(item.get("prim_path") or "")
     parts = [part for part in prim.split("/") if part]
     entity = next((name for name, last in prims.items() if last in parts), None)
@@ -39,7 +39,7 @@ def read_sensor(kind: str, item: Node, prims: Mapping[str, str], frames: dict[st
     if item.data.get("update_period"):
         item.note("ignored", "update_period", "rlcli updates sensors in every environment step")
     else:
-        item.skip("update_period")
+        item.mark_mapped("update_period")
     if kind == "ContactSensor":
         return _read_contact_sensor(item, entity, body)
     if kind == "RayCaster":
@@ -55,7 +55,7 @@ def _as_camera(item: Node) -> Node:
     """Return the settings of a camera of rays in the form of those of a camera."""
     why = "a rendered image, which shows the whole scene, and not only the meshes of the sensor"
     item.note("approximated", "mesh_prim_paths", why)
-    item.skip("pattern_cfg", "max_distance", "ray_alignment", "attach_yaw_only")
+    item.mark_mapped("pattern_cfg", "max_distance", "ray_alignment", "attach_yaw_only")
     pattern, far = dict(item.data["pattern_cfg"]), item.data.get("max_distance", 1e6)
     size = {key: pattern.pop(key) for key in ("width", "height")}
     spawn = {**pattern, "clipping_range": (0.01, far)}
@@ -139,7 +139,7 @@ def read_camera(item: Node, entity: str | None, inside: list[str]) -> dict[str, 
         config["entity"] = entity
         if inside:
             config["body"] = inside[-1]
-    spawn.skip(
+    spawn.mark_mapped(
         "func",
         "focus_distance",
         "f_stop",
@@ -149,14 +149,14 @@ def read_camera(item: Node, entity: str | None, inside: list[str]) -> dict[str, 
         "copy_from_source",
         "lock_camera",
     )
-    item.skip(
+    item.mark_mapped(
         "update_latest_camera_pose",
         "semantic_filter",
         "depth_clipping_behavior",
         "prim_path",
         "colorize_semantic_segmentation",
     )
-    item.skip(
+    item.mark_mapped(
         "colorize_instance_id_segmentation",
         "colorize_instance_segmentation",
         "semantic_segmentation_mapping",
@@ -211,7 +211,7 @@ def _rotated(quat: Sequence[float], axis: Sequence[float]) -> list[float]:
 
 
 def _read_contact_sensor(item: Node, entity: str, body: str | None) -> dict[str, Any]:
-    item.skip("track_contact_points", "track_friction_forces")
+    item.mark_mapped("track_contact_points", "track_friction_forces")
     item.note("approximated", "track_air_time", "times are multiples of the environment step, not of the physics step")
     config: dict[str, Any] = {"kind": "contact", "entity": entity, "bodies": body or ".*"}
     history = item.get("history_length", 0)
@@ -250,7 +250,7 @@ def _read_pattern(pattern: Node) -> Any:
     """Return the setting `pattern` of a ray sensor: a grid as a dict, or a list of directions of rays."""
     function = pattern.get("func")
     if kind_of(function) == "grid_pattern":
-        pattern.skip("ordering")
+        pattern.mark_mapped("ordering")
         grid = {
             "size": list(pattern.get("size", (1.0, 1.0))),
             "resolution": pattern.get("resolution", 0.1),
@@ -274,7 +274,7 @@ def _read_pattern(pattern: Node) -> Any:
 
 
 def _read_ray_sensor(item: Node, entity: str, body: str | None) -> dict[str, Any]:
-    item.skip("mesh_prim_paths", "history_length", "attach_yaw_only", "drift_range", "ray_cast_drift_range")
+    item.mark_mapped("mesh_prim_paths", "history_length", "attach_yaw_only", "drift_range", "ray_cast_drift_range")
     pattern, offset = item.node("pattern_cfg"), item.node("offset")
     config: dict[str, Any] = {"kind": "rays", "entity": entity}
     if body is not None:
@@ -284,14 +284,14 @@ def _read_ray_sensor(item: Node, entity: str, body: str | None) -> dict[str, Any
     rot = [as_float(value) for value in offset.data.get("rot", (1, 0, 0, 0))]
     if isinstance(config["pattern"], list):
         config["pattern"] = [_rotated(rot, ray) for ray in config["pattern"]]
-        offset.skip("rot")
+        offset.mark_mapped("rot")
     elif rot != [1, 0, 0, 0]:
         offset.note("ignored", "rot", "rays of a grid do not turn with the offset: set `direction` of the pattern")
     else:
-        offset.skip("rot")
+        offset.mark_mapped("rot")
     # Older versions of Isaac Lab have attach_yaw_only, newer ones ray_alignment.
     yaw_only = item.data.get("attach_yaw_only")
     config["alignment"] = "yaw" if yaw_only else item.get("ray_alignment", "base")
-    item.skip("ray_alignment")
+    item.mark_mapped("ray_alignment")
     config["max_distance"] = as_float(item.get("max_distance", 1e6))
     return config

@@ -137,8 +137,11 @@ class Node:
         if name in self and not is_empty(self.data[name]):
             self.report.entries[(*self.key, name)] = (status, why)
 
-    def skip(self, *names: str) -> None:
-        """Mark keys as mapped without reading them, because their values have no effect in rlcli."""
+    def mark_mapped(self, *names: str) -> None:
+        """Record keys as mapped without reading them here.
+
+        Their values are read elsewhere, or they have no effect on the simulation, such as colours of markers.
+        """
         for name in names:
             if name in self.data:
                 self.report.entries[(*self.key, name)] = ("mapped", "")

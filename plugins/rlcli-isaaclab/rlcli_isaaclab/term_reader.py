@@ -88,8 +88,8 @@ class TermReader(ObjectReader):
                     setting = source.get(key)
                     if known[ours].required or not equals_default(setting, known[ours].default):
                         config[ours] = to_plain(setting)
-        node.skip("debug_vis", "heading_command", "goal_pose_visualizer_cfg", "current_pose_visualizer_cfg")
-        node.skip("goal_vel_visualizer_cfg", "current_vel_visualizer_cfg", "ranges")
+        node.mark_mapped("debug_vis", "heading_command", "goal_pose_visualizer_cfg", "current_pose_visualizer_cfg")
+        node.mark_mapped("goal_vel_visualizer_cfg", "current_vel_visualizer_cfg", "ranges")
         if node.data.get("heading_command") is False:
             for key in ("heading", "heading_stiffness", "rel_heading"):
                 config.pop(key, None)
@@ -106,7 +106,7 @@ class TermReader(ObjectReader):
         """
         config: dict[str, Any] = {"resampling_time_s": finite_times(node.require("resampling_time_range"))}
         class_type = node.data.get("class_type")
-        node.skip("debug_vis")
+        node.mark_mapped("debug_vis")
         if isinstance(class_type, str) and not class_type.startswith(_ISAAC_LAB_MODULES) and ":" in class_type:
             settings = {key: node.get(key) for key in node.data if key not in OBJECT_KEYS}
             named = {("entity" if key == "asset_name" else key): value for key, value in settings.items()}
@@ -137,7 +137,7 @@ class TermReader(ObjectReader):
             config["history"] = history
         if not node.get("concatenate_terms", True):
             node.note("approximated", "concatenate_terms", "the terms of a group are always concatenated")
-        node.skip("concatenate_dim", "flatten_history_dim")
+        node.mark_mapped("concatenate_dim", "flatten_history_dim")
         return config
 
     def read_terms(self, section: str, name: str, node: Node) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -150,7 +150,7 @@ class TermReader(ObjectReader):
             self.report.entries[node.key] = ("ignored", "rlcli does not randomize colours and textures")
             return
         if section == "events" and function == "reset_root_state_uniform" and self._moves_nothing(node):
-            node.skip(*node.data)
+            node.mark_mapped(*node.data)
             return
         if section == "events" and function in EVENTS:
             node.get("func")
@@ -251,7 +251,7 @@ class TermReader(ObjectReader):
             min_steps = node.get("min_step_count_between_reset", 0)
             if min_steps:
                 config["min_steps_between"] = min_steps
-            node.skip("interval_range_s")
+            node.mark_mapped("interval_range_s")
         elif section == "observations":
             config |= read_processing(node)
         return config

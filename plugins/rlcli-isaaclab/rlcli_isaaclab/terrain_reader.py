@@ -46,13 +46,13 @@ _OTHER_KEYS = {
 
 def read_ground(item: Node, spawn: Node) -> dict[str, Any]:
     """Return the section `scene.ground` for a ground plane: size, height and friction."""
-    item.skip("prim_path", "collision_group", "debug_vis", "class_type")
+    item.mark_mapped("prim_path", "collision_group", "debug_vis", "class_type")
     init = item.node("init_state")
     x, y, height = (as_float(value) for value in init.get("pos", (0.0, 0.0, 0.0)))
-    init.skip("rot", "class_type")
+    init.mark_mapped("rot", "class_type")
     if (x, y) != (0.0, 0.0):
         init.note("approximated", "pos", "the middle of the plane is at x = y = 0")
-    spawn.skip("func", "visible", "color", "usd_path", "semantic_tags", "copy_from_source")
+    spawn.mark_mapped("func", "visible", "color", "usd_path", "semantic_tags", "copy_from_source")
     size = as_float(max(spawn.get("size", (PLANE_SIZE, PLANE_SIZE))))
     level = {"height": height} if height else {}
     return {"size": size, **level, **read_friction(spawn.node("physics_material"))}
@@ -63,8 +63,8 @@ def read_friction(material: Node) -> dict[str, float]:
 
     Without the key, rlcli's own default applies.
     """
-    material.skip("func", "restitution_combine_mode", "friction_combine_mode", "improve_patch_friction")
-    material.skip("compliant_contact_stiffness", "compliant_contact_damping")
+    material.mark_mapped("func", "restitution_combine_mode", "friction_combine_mode", "improve_patch_friction")
+    material.mark_mapped("compliant_contact_stiffness", "compliant_contact_damping")
     static = material.get("static_friction", 0.5)
     dynamic = material.get("dynamic_friction", 0.5)
     if static != dynamic:
@@ -72,19 +72,19 @@ def read_friction(material: Node) -> dict[str, float]:
     if material.data.get("restitution"):
         material.note("ignored", "restitution", "in MuJoCo, solref of a geom sets how contacts bounce")
     else:
-        material.skip("restitution")
+        material.mark_mapped("restitution")
     return {} if dynamic == 0.5 else {"friction": as_float(dynamic)}
 
 
 def read_terrain(item: Node, scene: dict[str, Any]) -> dict[str, Any] | None:
     """Return the section `scene.ground` for a plane; for a generator write `terrain` into `scene`, and return None."""
-    item.skip("class_type", "prim_path", "collision_group", "debug_vis", "num_envs", "env_spacing", "usd_path")
-    item.skip("visual_material", "use_terrain_origins")
+    item.mark_mapped("class_type", "prim_path", "collision_group", "debug_vis", "num_envs", "env_spacing", "usd_path")
+    item.mark_mapped("visual_material", "use_terrain_origins")
     kind = item.get("terrain_type", "generator")
     friction = read_friction(item.node("physics_material"))
     plane = {"size": PLANE_SIZE, **friction}
     if kind == "plane":
-        item.skip("terrain_generator", "max_init_terrain_level")
+        item.mark_mapped("terrain_generator", "max_init_terrain_level")
         return plane
     generator = item.node("terrain_generator")
     if kind != "generator" or not generator.data:
@@ -112,7 +112,7 @@ def _read_generator(node: Node) -> dict[str, Any]:
     }
     if node.get("seed") is not None:
         config["seed"] = node.get("seed")
-    node.skip("class_type", "color_scheme", "use_cache", "cache_dir", "vertical_scale", "border_height")
+    node.mark_mapped("class_type", "color_scheme", "use_cache", "cache_dir", "vertical_scale", "border_height")
     node.note("approximated", "slope_threshold", "steps are slopes as wide as one cell, not vertical walls")
     for name, patch in node.node("sub_terrains").nodes():
         config["sub_terrains"][name] = _read_sub_terrain(patch, config["resolution"])
@@ -126,7 +126,7 @@ def _read_sub_terrain(node: Node, resolution: float) -> dict[str, Any]:
     """
     function = kind_of(node.get("function"))
     proportion = as_float(node.get("proportion", 1.0))
-    node.skip("size", "horizontal_scale", "vertical_scale", "slope_threshold", "flat_patch_sampling")
+    node.mark_mapped("size", "horizontal_scale", "vertical_scale", "slope_threshold", "flat_patch_sampling")
     kind = _SUB_TERRAINS.get(function)
     border = as_float(node.get("border_width", 0.0))
     if kind is None:
@@ -134,7 +134,7 @@ def _read_sub_terrain(node: Node, resolution: float) -> dict[str, Any]:
         node.report.entries[node.key] = ("approximated", why)
         return {"kind": "flat", "proportion": proportion}
     inverted = "inverted" in function or bool(node.data.get("inverted"))
-    node.skip("inverted")
+    node.mark_mapped("inverted")
     config: dict[str, Any] = {"proportion": proportion, "kind": kind}
     if kind != "flat" and border:
         config["border"] = border

@@ -277,7 +277,7 @@ def relative(prim_path: str) -> str:
 
 
 def home(config: FilePath) -> FilePath:
-    """Return the folder of a task's files: that of its YAML, or the package that contains its `cfg/task`."""
+    """Return the folder of a task's files: the folder of its YAML; for PACKAGE/cfg/task/NAME.yaml it is PACKAGE."""
     inside = config.parent.parts[-2:] == ("cfg", "task")
     return config.parent.parent.parent if inside else config.parent
 

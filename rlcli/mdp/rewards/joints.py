@@ -23,12 +23,12 @@ def joint_pos_target_l2(env: ManagedEnv, *, entity: Entity = "robot", joints: Jo
 
 
 def joint_vel_l1(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
-    """Sum of the absolute joint velocities [rad/s]. (num_envs,)"""
+    """Sum of the absolute joint velocities [rad/s or m/s]. (num_envs,)"""
     return sum_columns(entity.data.joint_vel_of(joints).abs())
 
 
 def joint_vel_l2(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
-    """Sum of the squared joint velocities [rad^2/s^2]. (num_envs,)"""
+    """Sum of the squared joint velocities [rad^2/s^2 or m^2/s^2]. (num_envs,)"""
     return sum_columns(entity.data.joint_vel_of(joints).square())
 
 
