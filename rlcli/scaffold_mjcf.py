@@ -95,7 +95,9 @@ class Robot:
             locked.add(next((j for j in pair[:2] if j not in self.actuator), -1))
         # without any actuator in the file, the task drives every joint that can move
         self.driven = [j for j in self.joints if j in self.actuator or not (model.nu or j in locked)]
-        self.passive = [j for j in self.joints if j not in locked.union(self.driven)]
+        # joints of other bodies, such as objects that the robot moves, are not passive joints of the robot
+        own = {j for j in self.joints if model.body_rootid[model.jnt_bodyid[j]] == _ROOT}
+        self.passive = [j for j in self.joints if j in own and j not in locked.union(self.driven)]
         mujoco.mj_forward(model, self.data)
         self.com_height = float(self.data.subtree_com[_ROOT, 2]) if self.free else 0.0
         """Height of a floating robot's centre of mass above the ground in the default pose [m]."""

@@ -174,14 +174,12 @@ def signature_of(term: Any, name: str) -> Signature:
             "the source code of a term cannot be read; define the term in a .py file, at module level"
         ) from None
     call: ast.stmt | None = node
-    if isinstance(node, ast.ClassDef):
+    if is_class := isinstance(node, ast.ClassDef):
         call = constructor(SourceClass(Path(file or "?"), node), ClassSearch())
     if not isinstance(node, ast.FunctionDef | ast.ClassDef) or not isinstance(call, ast.FunctionDef):
-        is_class = isinstance(node, ast.ClassDef)
         found = "a class without __init__" if is_class else f"an object of type {type(term).__name__}"
         allowed = "a function (env, *, ...), or a class whose __init__ takes (self, env, *, ...)"
         raise SignatureError(f"found {found}; a term is {allowed}")
-    is_class = isinstance(node, ast.ClassDef)
     if not _takes_env(call.args, 1 if is_class else 0):
         found = ", ".join(argument.arg for argument in call.args.args) or "no parameters"
         first, allowed = ("of __init__ after 'self'", "self, env") if is_class else ("of a term", "env")

@@ -11,7 +11,7 @@ import torch
 import warp as wp
 
 from rlcli.errors import ConfigError, DeviceError, DivergedError, Problem, one_line
-from rlcli.sim.capacity import Capacity
+from rlcli.sim.contact_capacity import Capacity
 from rlcli.sim.skippable_work import skippable_flags
 
 _BIT = mjw.OverflowType

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from rlcli.config.schema import SimConfig
 from rlcli.errors import did_you_mean, listing
-from rlcli.sim.capacity import required_capacity
+from rlcli.sim.contact_capacity import required_capacity
 from rlcli.sim.env_selection import Selection
 from rlcli.sim.quiet_mujoco import quiet_mujoco
 from rlcli.sim.saved_tensors import require_matching_tensors, substate

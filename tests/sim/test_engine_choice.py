@@ -9,7 +9,7 @@ import sys
 import pytest
 import torch
 
-from rlcli.sim import capacity as _placed
+from rlcli.sim import contact_capacity as _placed
 
 ROOT = os.path.dirname(os.path.dirname(os.path.dirname(_placed.__file__)))
 no_gpu = pytest.mark.skipif(torch.cuda.is_available(), reason="the test needs a machine without a GPU")

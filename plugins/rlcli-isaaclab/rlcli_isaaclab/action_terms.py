@@ -12,7 +12,7 @@ from torch import Tensor
 from rlcli.scene.names import match_values
 from rlcli_isaaclab.managers import ActionTerm
 from rlcli_isaaclab.operational_space import OperationalSpaceControllerAction
-from rlcli_isaaclab.table import ACTIONS
+from rlcli_isaaclab.term_counterparts import ACTIONS
 
 _OWN = "rlcli_isaaclab"
 

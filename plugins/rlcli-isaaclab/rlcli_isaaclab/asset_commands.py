@@ -16,7 +16,7 @@ from rlcli.scene.jacobian import Jacobian
 from rlcli.scene.model_fields import DERIVED_FROM
 from rlcli.sim.env_selection import Selection
 from rlcli.sim.rotations import rotate
-from rlcli_isaaclab.absent import report_once
+from rlcli_isaaclab.missing_names import report_once
 from rlcli_isaaclab.substeps import Substeps, update_state
 from rlcli_isaaclab.utils.math import skew_symmetric_matrix
 

@@ -14,7 +14,7 @@ from rlcli.scene.entity import Entity
 from rlcli.scene.entity_data import EntityData
 from rlcli.sim.env_selection import ALL
 from rlcli.sim.rotations import conjugate, multiply, rotate, rotate_inverse
-from rlcli_isaaclab.absent import user_place
+from rlcli_isaaclab.missing_names import user_place
 from rlcli_isaaclab.substeps import update_state
 from rlcli_isaaclab.utils.math import quat_from_matrix
 

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from rlcli.errors import TaskError, listing
-from rlcli_isaaclab.absent import user_place
 from rlcli_isaaclab.config_class import MISSING, configclass
+from rlcli_isaaclab.missing_names import user_place
 from rlcli_isaaclab.operational_space import OperationalSpaceController
 from rlcli_isaaclab.utils.math import apply_delta_pose, compute_pose_error
 

@@ -15,11 +15,11 @@ from rlcli_isaaclab import convert
 from rlcli_isaaclab.config_class import is_missing, to_dict
 from rlcli_isaaclab.direct_env import DirectRLEnvCfg, record, shape_of
 from rlcli_isaaclab.direct_terms import HookTerm
-from rlcli_isaaclab.own_fields import own_fields
 from rlcli_isaaclab.scene_facade import Asset
 from rlcli_isaaclab.scene_reader import SceneReader
 from rlcli_isaaclab.sensor_facade import TerrainImporter
 from rlcli_isaaclab.settings import Node, Report
+from rlcli_isaaclab.task_fields import own_fields
 from rlcli_isaaclab.term_reader import TermReader
 from rlcli_isaaclab.user_actuators import actuator_events
 from rlcli_isaaclab.user_files import reads_body_forces

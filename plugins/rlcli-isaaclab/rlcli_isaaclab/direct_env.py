@@ -22,11 +22,11 @@ import torch
 from torch import Tensor
 
 from rlcli.errors import ConfigError, Problem, TaskError
-from rlcli_isaaclab.absent import user_place
 from rlcli_isaaclab.config_class import MISSING, configclass, fill_missing
-from rlcli_isaaclab.own_fields import set_valid_fields
+from rlcli_isaaclab.missing_names import user_place
 from rlcli_isaaclab.setup_scene import Setup, running
 from rlcli_isaaclab.sim import SimulationCfg
+from rlcli_isaaclab.task_fields import set_valid_fields
 from rlcli_isaaclab.user_files import adapt_to_device
 
 MANAGED: ContextVar[Any] = ContextVar("managed")

@@ -16,11 +16,11 @@ from rlcli.config.term_signatures import Signature
 from rlcli.errors import TaskError
 from rlcli.managers.attribute_state import AttributeState
 from rlcli.sim.env_selection import Selection
-from rlcli_isaaclab.absent import place_of
 from rlcli_isaaclab.direct_env import DirectRLEnv, building
+from rlcli_isaaclab.missing_names import place_of
 from rlcli_isaaclab.observation_noise import noise_model
-from rlcli_isaaclab.own_fields import set_own_fields
 from rlcli_isaaclab.substeps import Substeps
+from rlcli_isaaclab.task_fields import set_own_fields
 from rlcli_isaaclab.user_files import adapt_to_device
 from rlcli_isaaclab.utils.buffers import call_without_effects
 

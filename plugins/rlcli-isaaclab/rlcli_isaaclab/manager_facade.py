@@ -13,7 +13,7 @@ from torch import Tensor
 
 from rlcli.errors import did_you_mean, listing
 from rlcli.scene.names import NameProblem
-from rlcli_isaaclab.absent import absence, user_place
+from rlcli_isaaclab.missing_names import absence, user_place
 
 
 class ManagerFacade:

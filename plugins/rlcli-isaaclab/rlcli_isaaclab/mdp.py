@@ -15,12 +15,12 @@ from torch import Tensor
 
 from rlcli.config.term_signatures import SECTIONS, Parameter, builtin_terms
 from rlcli.errors import did_you_mean
-from rlcli_isaaclab.absent import absent_class, absent_value
 from rlcli_isaaclab.config_class import MISSING, config_subclass, configclass
 from rlcli_isaaclab.curricula import modify_env_param, modify_term_cfg
 from rlcli_isaaclab.lab_terms import LAB_TERMS
 from rlcli_isaaclab.managers import ActionTermCfg, CommandTermCfg, SceneEntityCfg
-from rlcli_isaaclab.table import TERMS, Entry
+from rlcli_isaaclab.missing_names import absent_class, absent_value
+from rlcli_isaaclab.term_counterparts import TERMS, Entry
 from rlcli_isaaclab.utils.math import sample_gaussian, sample_log_uniform, sample_uniform
 
 

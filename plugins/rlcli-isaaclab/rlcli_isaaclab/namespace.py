@@ -21,7 +21,9 @@ from typing import Any
 from rlcli.errors import did_you_mean
 from rlcli.registry.framework_imports import import_package, is_task_package
 from rlcli.registry.task_imports import import_from
-from rlcli_isaaclab.absent import (
+from rlcli_isaaclab.config_class import configclass
+from rlcli_isaaclab.format import LIBRARIES, TRAINERS
+from rlcli_isaaclab.missing_names import (
     AbsentValue,
     absent_class,
     absent_function,
@@ -29,8 +31,6 @@ from rlcli_isaaclab.absent import (
     absent_value,
     user_place,
 )
-from rlcli_isaaclab.config_class import configclass
-from rlcli_isaaclab.format import LIBRARIES, TRAINERS
 
 _OWN = "rlcli_isaaclab"
 _EXTRA = {

@@ -6,12 +6,12 @@ from collections.abc import Mapping
 from typing import Any
 
 from rlcli.config.term_signatures import builtin_terms
-from rlcli_isaaclab.absent import reason_of
 from rlcli_isaaclab.action_terms import driven_by, find_action
 from rlcli_isaaclab.config_class import is_missing
+from rlcli_isaaclab.missing_names import reason_of
 from rlcli_isaaclab.scene_reader import SceneReader
 from rlcli_isaaclab.settings import Key, Node, Report, as_float, equals_default, kind_of, to_plain
-from rlcli_isaaclab.table import ACTIONS, ONCE_PER_STEP
+from rlcli_isaaclab.term_counterparts import ACTIONS, ONCE_PER_STEP
 from rlcli_isaaclab.term_values import has_no_effect, is_plain
 
 OBJECT_KEYS = ("class_type", "resampling_time_range", "debug_vis")

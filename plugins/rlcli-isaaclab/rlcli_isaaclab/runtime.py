@@ -20,7 +20,6 @@ from rlcli.envs.make import make_env
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import did_you_mean, listing
 from rlcli.registry import is_framework, load_object
-from rlcli_isaaclab.absent import user_place
 from rlcli_isaaclab.manager_facade import (
     ActionManagerFacade,
     CommandManagerFacade,
@@ -29,6 +28,7 @@ from rlcli_isaaclab.manager_facade import (
     RewardManagerFacade,
     TerminationManagerFacade,
 )
+from rlcli_isaaclab.missing_names import user_place
 from rlcli_isaaclab.multirotor import Multirotor
 from rlcli_isaaclab.scene_facade import Scene
 from rlcli_isaaclab.settings import kind_of

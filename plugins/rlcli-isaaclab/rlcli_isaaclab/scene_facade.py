@@ -14,9 +14,9 @@ from rlcli.errors import TaskError, did_you_mean, listing
 from rlcli.scene.entity import Entity
 from rlcli.scene.names import NameProblem
 from rlcli.sim.rotations import conjugate, multiply, rotate, rotate_inverse
-from rlcli_isaaclab.absent import NoEffect, absence
 from rlcli_isaaclab.asset_commands import BodyWrench, JointDrive, PhysxView
 from rlcli_isaaclab.asset_data import Data
+from rlcli_isaaclab.missing_names import NoEffect, absence
 from rlcli_isaaclab.sensor_facade import FrameTransformer, TerrainImporter, bound, camera_or_sensor, find_elements
 from rlcli_isaaclab.sensor_reader import filter_name
 from rlcli_isaaclab.setup_scene import current_setup

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from rlcli.errors import ConfigError, TaskError, did_you_mean, listing
-from rlcli_isaaclab.absent import AbsentValue, reason_of
 from rlcli_isaaclab.actuator_reader import JointSettings, add_joint_settings, read_actuators, settings_of
 from rlcli_isaaclab.collection import entity_name
 from rlcli_isaaclab.light_reader import read_light
+from rlcli_isaaclab.missing_names import AbsentValue, reason_of
 from rlcli_isaaclab.model_lookup import given_models, is_end_of, mjcf_of, model_hint
 from rlcli_isaaclab.sensor_reader import camera_kinds, filter_name, image_name, read_filters, read_sensor
 from rlcli_isaaclab.settings import Key, Node, Report, as_float, base_kind, kind_of

@@ -14,7 +14,7 @@ from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import did_you_mean, listing
 from rlcli.scene.names import NameProblem, match
 from rlcli.sim.rotations import conjugate, multiply, rotate, rotate_inverse
-from rlcli_isaaclab.absent import absence, user_place
+from rlcli_isaaclab.missing_names import absence, user_place
 from rlcli_isaaclab.sensor_reader import image_name
 from rlcli_isaaclab.setup_scene import current_setup
 

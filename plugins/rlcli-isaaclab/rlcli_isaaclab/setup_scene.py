@@ -12,7 +12,7 @@ from contextvars import ContextVar
 from typing import Any
 
 from rlcli.errors import TaskError
-from rlcli_isaaclab.absent import absence
+from rlcli_isaaclab.missing_names import absence
 
 
 class Setup:

@@ -9,13 +9,13 @@ from typing import Any
 from rlcli.config.term_signatures import Signature, SignatureError, builtin_terms, snake_case
 from rlcli.errors import ConfigError, Problem, did_you_mean, listing
 from rlcli_isaaclab import command_terms
-from rlcli_isaaclab.absent import AbsentValue, reason_of
 from rlcli_isaaclab.changed_setting_reader import read_changed_setting
 from rlcli_isaaclab.config_class import is_missing
 from rlcli_isaaclab.curricula import modify_env_param
 from rlcli_isaaclab.lab_terms import LAB_TERMS, command_resample
 from rlcli_isaaclab.managers import CommandTerm
 from rlcli_isaaclab.mdp import MdpFunction
+from rlcli_isaaclab.missing_names import AbsentValue, reason_of
 from rlcli_isaaclab.object_reader import OBJECT_KEYS, ObjectReader
 from rlcli_isaaclab.observation_reader import read_processing
 from rlcli_isaaclab.own_processing import ProcessedTerm, take_own_processing
@@ -23,7 +23,7 @@ from rlcli_isaaclab.randomization import EVENTS, translate_event
 from rlcli_isaaclab.scene_reader import SceneReader
 from rlcli_isaaclab.sensor_reader import choose_image
 from rlcli_isaaclab.settings import Key, Node, Report, as_float, equals_default, kind_of, to_plain
-from rlcli_isaaclab.table import (
+from rlcli_isaaclab.term_counterparts import (
     COMMANDS,
     EFFORT_TERMS,
     HEIGHT_TERMS,
@@ -35,7 +35,7 @@ from rlcli_isaaclab.term_values import builtin_name, is_entity, is_plain, order_
 
 _READS_COMMAND = "command_manager.get_term("
 _ISAAC_LAB_MODULES = ("isaaclab", "omni.isaac.lab", "mdp.")
-"""Prefixes of modules of Isaac Lab, whose functions are translated by `table.py`, not run."""
+"""Prefixes of modules of Isaac Lab, whose functions are translated by `term_counterparts.py`, not run."""
 
 
 def _functions(data: Any) -> Iterator[Any]:
@@ -216,7 +216,7 @@ class TermReader(ObjectReader):
         return config
 
     def _find_builtin(self, section: str, name: str | None) -> tuple[str | None, Entry]:
-        """Return rlcli's name of one of Isaac Lab's terms, and its entry in `table.py`.
+        """Return rlcli's name of one of Isaac Lab's terms, and its entry in `term_counterparts.py`.
 
         The name is None if rlcli has no such term. For a term without an entry, the returned entry is empty.
         """

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlcli.errors import pip_install
-from rlcli_isaaclab.absent import absence
+from rlcli_isaaclab.missing_names import absence
 
 
 class Trimesh:

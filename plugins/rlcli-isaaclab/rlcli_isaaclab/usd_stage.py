@@ -6,8 +6,8 @@ from types import SimpleNamespace
 from typing import Any
 
 from rlcli.errors import TaskError
-from rlcli_isaaclab.absent import absence
 from rlcli_isaaclab.direct_env import MANAGED
+from rlcli_isaaclab.missing_names import absence
 
 
 class Prim:

@@ -81,7 +81,7 @@ def _add_media(page: Page, run: Run, checkpoint: Path | None, *, no_eval: bool, 
         The origin of the evaluation and the origin of the video. Each is `stored` (a file of the run), `made` (by
         this call), `older` (a file of an earlier checkpoint) or an empty text (the page has none).
     """
-    from rlcli.reporting.page_evaluation import PageMedia
+    from rlcli.reporting.page_media import PageMedia
 
     if checkpoint is None:
         page.missing["evaluation"] = "There is no evaluation: the run has no complete checkpoint."

@@ -105,6 +105,16 @@ def test_joints_with_different_defaults_have_a_condition_each(cli, tmp_path):
     assert targets == {("hinge",): 0.0, ("second",): 0.5}
 
 
+def test_joints_of_an_object_are_no_passive_joints_of_the_arm(cli, tmp_path):
+    box = (
+        '<body name="box" pos="1 0 0"><joint name="x" type="slide" axis="1 0 0"/><geom size="0.05"/></body></worldbody>'
+    )
+    _, task = written(cli, tmp_path, ARM.replace("</worldbody>", box))
+    goal = task["commands"]["goal"]
+    assert (goal["func"], goal["bodies"], goal["joints"]) == ("reachable_position", "hand", ["a", "b", "c"])
+    assert "x" not in str(task["observations"])
+
+
 def test_fixed_base_reaches_with_its_last_body(cli, tmp_path):
     _, task = written(cli, tmp_path, ARM)
     goal = task["commands"]["goal"]

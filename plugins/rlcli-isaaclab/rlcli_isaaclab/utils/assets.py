@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from rlcli.errors import TaskError
-from rlcli_isaaclab.absent import user_place
+from rlcli_isaaclab.missing_names import user_place
 
 NUCLEUS_ASSET_ROOT_DIR = "nucleus"
 NVIDIA_NUCLEUS_DIR = f"{NUCLEUS_ASSET_ROOT_DIR}/NVIDIA"

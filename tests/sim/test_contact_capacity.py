@@ -8,7 +8,7 @@ from support.worlds import build
 
 from rlcli.config.schema import SimConfig
 from rlcli.errors import DivergedError
-from rlcli.sim.capacity import required_capacity
+from rlcli.sim.contact_capacity import required_capacity
 from rlcli.sim.engine import open_engine
 
 torch.set_num_threads(1)
