@@ -24,6 +24,7 @@ import torch
 from torch import Tensor
 
 from rlcli.config.load import resolve
+from rlcli.deploy.actuator_formulas import has_nominal_gains
 from rlcli.deploy.closed_loop_result import ClosedLoopResult
 from rlcli.deploy.env_description import describe
 from rlcli.deploy.export import Exported, relative_difference
@@ -195,8 +196,14 @@ class _PlainMujocoRunner:
         closed = [c for control in self._plan["controls"] if control["closed"] for c in control["ctrl"]]
         self._closed = np.zeros(model.nu, dtype=bool)
         """Controls that a formula in the policy's metadata computes, by index of the control."""
+        self._actuator_models = [(m, env.actuators[m["name"]]) for m in self._plan["actuator_models"] if m["closed"]]
+        """Actuator models with a formula in the metadata, and those of the environment."""
+        self._random_gains: set[str] = set()
+        """Names of the actuator models that had other gains than the formula in some environment."""
         try:
             self._closed[closed] = True
+            for actuator_model in self._plan["actuator_models"]:
+                self._closed[actuator_model["ctrl"]] = False  # `_compute_actuator_models` checks these
             self._bounds = _control_bounds(controller, model)
         except _BAD_METADATA as error:
             raise _metadata_error(error) from error
@@ -238,12 +245,14 @@ class _PlainMujocoRunner:
         pairs = (torch.from_numpy(values[:, self._closed]) for values in (self._ctrl, allowed))
         self._record_difference("control", *pairs)
         calls = self._env.calls_per_step
-        for _ in range(calls):
+        for call in range(calls):
             if self._env.actuators:
                 self._env.compute_efforts()
             forces = {name: self._engine.field(name).numpy() for name in _FORCES}
+            commanded = np.where(self._closed, self._ctrl, ctrl)
+            self._compute_actuator_models(commanded, ctrl, compare=call == 0 or not self._synchronize)
             for i, data in enumerate(self._datas):
-                data.ctrl[:] = np.where(self._closed, self._ctrl[i], ctrl[i])
+                data.ctrl[:] = commanded[i]
                 for name, values in forces.items():
                     applied = getattr(data, name)
                     if not np.array_equal(applied, values[i]):  # the force was set by the step, not by an event
@@ -259,6 +268,28 @@ class _PlainMujocoRunner:
             self._synchronize_states()
         self._rows = [self._engine.state_row(i) for i in range(len(self._datas))]
         self.steps += len(self._datas)
+
+    def _compute_actuator_models(self, commanded: np.ndarray, ctrl: np.ndarray, *, compare: bool) -> None:
+        """Write the controls of the actuator models that have a formula to `commanded`, for the next physics step.
+
+        An environment with other gains than those of the formula keeps the controls of the environment's engine.
+
+        Args:
+            commanded: controls for plain MuJoCo; changed in place. (num_envs, nu)
+            ctrl: controls that the environment computed. (num_envs, nu)
+            compare: whether to record the differences of the two; only if both sides have the same state.
+        """
+        for i, controller in enumerate(self._controllers if self._actuator_models else ()):
+            computed = controller.controls(self._datas[i])
+            for described, model in self._actuator_models:
+                at = described["ctrl"]
+                if not has_nominal_gains(model, i):
+                    self._random_gains.add(described["name"])
+                    continue
+                allowed = np.clip(ctrl[i], *self._bounds)[at]
+                if compare:
+                    self._record_difference("control", torch.from_numpy(computed[at]), torch.from_numpy(allowed))
+                commanded[i, at] = computed[at]
 
     def _update_derived(self, i: int) -> None:
         # mj_step leaves positions and sensors of the state before it; mj_step1 computes those of the new state
@@ -289,7 +320,10 @@ class _PlainMujocoRunner:
 
     def terms(self, *, closed: bool) -> list[str]:
         """Return the names of the terms that the generated program can compute (`closed`), or of the others."""
-        kinds = {"observation": self._plan["observations"], "control": self._plan["controls"]}
+        models = [
+            {**m, "closed": m["closed"] and m["name"] not in self._random_gains} for m in self._plan["actuator_models"]
+        ]
+        kinds = {"observation": self._plan["observations"], "control": self._plan["controls"], "actuator": models}
         named = [f"{kind} {t['name']}" for kind, terms in kinds.items() for t in terms if t["closed"] is closed]
         return named if closed else [*named, *(f"force data.{name}" for name in sorted(self._forces))]
 
