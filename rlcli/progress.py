@@ -3,7 +3,7 @@
 import contextlib
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from typing import TypeVar
@@ -27,6 +27,8 @@ class Work:
     environments: `done` stays 0 until the first part ends."""
     has_own_view: bool = False
     """Whether the operation shows its own progress, so that no second progress bar may be drawn."""
+    phases: Sequence[str] = ()
+    """Names of the parts, if they are done one after the other and differ in kind; `what` is then not shown."""
     begin: float = field(default_factory=time.monotonic)
     """Start of the work, by `time.monotonic` [s]."""
     changed: float = field(default_factory=time.monotonic)
@@ -42,6 +44,13 @@ class Work:
         """Set the number of parts that are done, and the operation's own estimate of the share (`share`)."""
         self.done, self.share, self.changed = done, share, time.monotonic()
 
+    def text(self) -> str:
+        """Return the name, with the number of parts that are done or, for named parts, with the present one."""
+        if self.phases:
+            number = min(self.done, len(self.phases) - 1)
+            return f"{number + 1} of {len(self.phases)}: {self.phases[number]}"
+        return f"{self.what} {self.done:,}/{self.total:,}" if self.total else self.what
+
     def fraction(self) -> float:
         """Return the share of the work that is done, from 0 to 1; 0 if it is unknown."""
         return min(1.0, max(self.share, self.done / self.total if self.total else 0.0))
@@ -56,7 +65,9 @@ None: nothing is shown.
 
 
 @contextlib.contextmanager
-def track(what: str, total: int | None = None, *, has_own_view: bool = False) -> Iterator[Work]:
+def track(
+    what: str, total: int | None = None, *, has_own_view: bool = False, phases: Sequence[str] = ()
+) -> Iterator[Work]:
     """Report the progress of the operation in the `with` block.
 
     The block calls `advance` or `update` of the `Work` that it receives. A nested operation is shown below the outer
@@ -66,8 +77,9 @@ def track(what: str, total: int | None = None, *, has_own_view: bool = False) ->
         what: what is counted, such as `episodes`.
         total: the number of parts; None: unknown.
         has_own_view: whether the operation shows its own progress, so that no second progress bar may be drawn.
+        phases: names of the parts, if they are done one after the other and differ in kind; replaces `total`.
     """
-    work = Work(what, total, has_own_view=has_own_view)
+    work = Work(what, len(phases) or total, has_own_view=has_own_view, phases=phases)
     shown = view(_running) if view is not None and not _running else contextlib.nullcontext()
     _running.append(work)
     try:

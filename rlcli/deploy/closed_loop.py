@@ -16,7 +16,6 @@ import logging
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -25,14 +24,17 @@ import torch
 from torch import Tensor
 
 from rlcli.config.load import resolve
+from rlcli.deploy.actuator_formulas import has_nominal_gains
+from rlcli.deploy.closed_loop_result import ClosedLoopResult
 from rlcli.deploy.env_description import describe
-from rlcli.deploy.export import TOLERANCE, Exported, relative_difference
+from rlcli.deploy.export import Exported, relative_difference
 from rlcli.deploy.run_policy_files import PROGRAM, generate_program, open_model, write_model, write_program
 from rlcli.envs.direct import DirectEnv
 from rlcli.envs.make import make_env
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import CheckpointError, UsageError
 from rlcli.evaluation.evaluate import Evaluation, evaluate
+from rlcli.progress import track
 from rlcli.random import derive
 from rlcli.registry import TaskSource
 from rlcli.rl.action_functions import trained_policy
@@ -45,13 +47,10 @@ from rlcli.runs.restore import require_fit
 
 _log = logging.getLogger(__name__)
 
-CLOSE = 1e-4
-"""Largest accepted difference of an observation or a control, relative to max(1, |value|)."""
 ROUNDING = 1e-3
 """Largest difference of actions, and of states after one step, that counts as a rounding error."""
-RETURN = 0.02
-"""Largest accepted difference of the mean return, relative to the evaluation's mean |return|."""
 _SEED = 42
+_PHASES = ("evaluation", "plain MuJoCo", "plain MuJoCo, re-synchronised (only if the returns differ)")
 _FREE = (-np.inf, np.inf)
 _BAD_METADATA = (KeyError, IndexError, TypeError, ValueError)
 """Exceptions that the generated program raises if the metadata does not fit the model."""
@@ -66,91 +65,16 @@ class ReferenceEnv:
     """Description of the environment for programs without rlcli."""
 
 
-@dataclass(slots=True)
-class ClosedLoopResult:
-    """Result of the check of an exported policy in plain MuJoCo against the environment.
-
-    A difference between two values is divided by max(1, |value|).
-    """
-
-    model: Path
-    program: Path
-    differing: list[str]
-    """Keys of the metadata whose values differ from the task's."""
-    episodes: int
-    steps: int
-    differences: dict[str, float]
-    """Largest difference of `action`, `observation` and `control`."""
-    evaluation_return: float
-    """Mean return of the run's evaluation."""
-    plain_return: float
-    """Mean return in plain MuJoCo."""
-    scale: float
-    """Mean absolute return of the evaluation's episodes, by which differences of returns are divided."""
-    by_metadata: list[str]
-    """Terms that the generated program computed from formulas in the metadata."""
-    by_task: list[str]
-    """Terms without a formula, and forces, which the task's own code computed from the states of plain MuJoCo."""
-    synchronized_return: float | None = None
-    """Mean return with the environment's state set after every step; None: not needed, `plain_return` agrees."""
-    disagreeing_steps: int = 0
-    """Re-synchronised steps after which the states of the two sides differed by more than rounding."""
-
-    @property
-    def return_difference(self) -> float:
-        """Relative difference of the mean returns in plain MuJoCo and in the evaluation."""
-        return self._relative(self.plain_return)
-
-    def rows(self) -> list[tuple[str, float, float, bool]]:
-        """Return one row for each check: (name, value found, largest value allowed, whether the check passed)."""
-        synchronized = self.synchronized_return
-        returns = self.return_difference if synchronized is None else self._relative(synchronized)
-        suffix = "" if synchronized is None else " (re-synchronised)"
-        checks = (
-            ("description: entries that differ from the task", float(len(self.differing)), 0.0),
-            ("action: exported file - policy", self.differences["action"], TOLERANCE),
-            ("observation: formulas - task", self.differences["observation"], CLOSE),
-            ("control: formulas - task", self.differences["control"], CLOSE),
-            (f"return: plain MuJoCo - evaluation{suffix}", returns, RETURN),
-        )
-        return [(name, found, allowed, found <= allowed) for name, found, allowed in checks]
-
-    @property
-    def holds(self) -> bool:
-        """Whether every check passed. A NaN fails its check."""
-        return all(row[3] for row in self.rows())
-
-    def record(self) -> dict[str, Any]:
-        """Return the result as data for JSON."""
-        synchronized = None
-        if self.synchronized_return is not None:
-            synchronized = {"return": self.synchronized_return, "parted": self.disagreeing_steps}
-        return {
-            "passed": self.holds,
-            "episodes": self.episodes,
-            "steps": self.steps,
-            "model": str(self.model),
-            "program": str(self.program),
-            "return": self.plain_return,
-            "evaluation_return": self.evaluation_return,
-            "side_by_side": synchronized,
-            "checks": [dict(zip(("check", "found", "allowed", "passed"), row, strict=True)) for row in self.rows()],
-            "unlike": self.differing,
-            "closed_by_metadata": self.by_metadata,
-            "closed_by_task": self.by_task,
-        }
-
-    def _relative(self, mean_return: float) -> float:
-        return abs(mean_return - self.evaluation_return) / max(self.scale, 1e-9)
-
-
-def open_reference(choice: Choice, checkpoint: Checkpoint, named: TaskSource | None) -> ReferenceEnv:
+def open_reference(choice: Choice, checkpoint: Checkpoint, named: TaskSource | None, episodes: int) -> ReferenceEnv:
     """Build the environment that a policy was trained for, without observation noise, bias and delays.
+
+    It has as many parallel environments as the episodes need, even if the run has more.
 
     Args:
         choice: the policy that the user has chosen.
         checkpoint: the checkpoint of the policy.
         named: the task that the user has named; None: the task of the run.
+        episodes: number of episodes that will run.
     """
     configure = partial(resolve, choice.source(named), agent=choice.agent, play=True)
     resolved = configure()
@@ -158,8 +82,9 @@ def open_reference(choice: Choice, checkpoint: Checkpoint, named: TaskSource | N
     # noise and bias of observations are random, so an exported file cannot reproduce them
     clean = [f"observations.{name}.enable_corruption=false" for name, group in groups if group.enable_corruption]
     clean += [f"actions.{name}.delay=null" for name, term in resolved.task.actions.items() if term and term.delay]
-    if clean:
-        resolved = configure(overrides=clean)
+    # at least two: with one, values that are random in each environment would look like constants of the task
+    clean.append(f"scene.num_envs={min(resolved.task.scene.num_envs, max(2, episodes))}")
+    resolved = configure(overrides=clean)
     torch.set_num_threads(1)
     seed_generators(derive(_SEED, "task"))
     env = make_env(resolved, seed=derive(_SEED, "evaluation"))
@@ -200,9 +125,9 @@ def verify(
     controller, policy = space["Controller"](file), checkpoint.policy()
     initial = env.state_dict()
     seed_generators(derive(_SEED, "task"))
-    evaluated = evaluate(env, trained_policy(env, policy), episodes)
 
     def run_plain(synchronize: bool) -> tuple[_PlainMujocoRunner, Evaluation]:
+        work.advance()
         env.load_state_dict(initial)  # also restores the curriculum
         seed_generators(derive(_SEED, "task"))
         runner = _PlainMujocoRunner(env, policy, controller, open_model(model), synchronize)
@@ -212,25 +137,27 @@ def verify(
         finally:
             env.physics_override = None
 
-    runner, plain = run_plain(synchronize=False)
-    result = ClosedLoopResult(
-        model,
-        program,
-        differing,
-        len(plain.returns),
-        runner.steps,
-        runner.differences,
-        evaluation_return=float(np.mean(evaluated.returns)),
-        plain_return=float(np.mean(plain.returns)),
-        scale=float(np.mean(np.abs(evaluated.returns))),
-        by_metadata=runner.terms(closed=True),
-        by_task=runner.terms(closed=False),
-    )
-    only_return_failed = not result.holds and all(passed for *_, passed in result.rows()[:-1])
-    if only_return_failed:
-        runner, plain = run_plain(synchronize=True)
-        result.synchronized_return = float(np.mean(plain.returns))
-        result.disagreeing_steps = runner.disagreeing_steps
+    with track("verification", phases=_PHASES) as work:
+        evaluated = evaluate(env, trained_policy(env, policy), episodes)
+        runner, plain = run_plain(synchronize=False)
+        result = ClosedLoopResult(
+            model,
+            program,
+            differing,
+            len(plain.returns),
+            runner.steps,
+            runner.differences,
+            evaluation_return=float(np.mean(evaluated.returns)),
+            plain_return=float(np.mean(plain.returns)),
+            scale=float(np.mean(np.abs(evaluated.returns))),
+            by_metadata=runner.terms(closed=True),
+            by_task=runner.terms(closed=False),
+        )
+        only_return_failed = not result.holds and all(passed for *_, passed in result.rows()[:-1])
+        if only_return_failed:
+            runner, plain = run_plain(synchronize=True)
+            result.synchronized_return = float(np.mean(plain.returns))
+            result.disagreeing_steps = runner.disagreeing_steps
     return result
 
 
@@ -269,8 +196,14 @@ class _PlainMujocoRunner:
         closed = [c for control in self._plan["controls"] if control["closed"] for c in control["ctrl"]]
         self._closed = np.zeros(model.nu, dtype=bool)
         """Controls that a formula in the policy's metadata computes, by index of the control."""
+        self._actuator_models = [(m, env.actuators[m["name"]]) for m in self._plan["actuator_models"] if m["closed"]]
+        """Actuator models with a formula in the metadata, and those of the environment."""
+        self._random_gains: set[str] = set()
+        """Names of the actuator models that had other gains than the formula in some environment."""
         try:
             self._closed[closed] = True
+            for actuator_model in self._plan["actuator_models"]:
+                self._closed[actuator_model["ctrl"]] = False  # `_compute_actuator_models` checks these
             self._bounds = _control_bounds(controller, model)
         except _BAD_METADATA as error:
             raise _metadata_error(error) from error
@@ -312,12 +245,14 @@ class _PlainMujocoRunner:
         pairs = (torch.from_numpy(values[:, self._closed]) for values in (self._ctrl, allowed))
         self._record_difference("control", *pairs)
         calls = self._env.calls_per_step
-        for _ in range(calls):
+        for call in range(calls):
             if self._env.actuators:
                 self._env.compute_efforts()
             forces = {name: self._engine.field(name).numpy() for name in _FORCES}
+            commanded = np.where(self._closed, self._ctrl, ctrl)
+            self._compute_actuator_models(commanded, ctrl, compare=call == 0 or not self._synchronize)
             for i, data in enumerate(self._datas):
-                data.ctrl[:] = np.where(self._closed, self._ctrl[i], ctrl[i])
+                data.ctrl[:] = commanded[i]
                 for name, values in forces.items():
                     applied = getattr(data, name)
                     if not np.array_equal(applied, values[i]):  # the force was set by the step, not by an event
@@ -333,6 +268,28 @@ class _PlainMujocoRunner:
             self._synchronize_states()
         self._rows = [self._engine.state_row(i) for i in range(len(self._datas))]
         self.steps += len(self._datas)
+
+    def _compute_actuator_models(self, commanded: np.ndarray, ctrl: np.ndarray, *, compare: bool) -> None:
+        """Write the controls of the actuator models that have a formula to `commanded`, for the next physics step.
+
+        An environment with other gains than those of the formula keeps the controls of the environment's engine.
+
+        Args:
+            commanded: controls for plain MuJoCo; changed in place. (num_envs, nu)
+            ctrl: controls that the environment computed. (num_envs, nu)
+            compare: whether to record the differences of the two; only if both sides have the same state.
+        """
+        for i, controller in enumerate(self._controllers if self._actuator_models else ()):
+            computed = controller.controls(self._datas[i])
+            for described, model in self._actuator_models:
+                at = described["ctrl"]
+                if not has_nominal_gains(model, i):
+                    self._random_gains.add(described["name"])
+                    continue
+                allowed = np.clip(ctrl[i], *self._bounds)[at]
+                if compare:
+                    self._record_difference("control", torch.from_numpy(computed[at]), torch.from_numpy(allowed))
+                commanded[i, at] = computed[at]
 
     def _update_derived(self, i: int) -> None:
         # mj_step leaves positions and sensors of the state before it; mj_step1 computes those of the new state
@@ -363,7 +320,10 @@ class _PlainMujocoRunner:
 
     def terms(self, *, closed: bool) -> list[str]:
         """Return the names of the terms that the generated program can compute (`closed`), or of the others."""
-        kinds = {"observation": self._plan["observations"], "control": self._plan["controls"]}
+        models = [
+            {**m, "closed": m["closed"] and m["name"] not in self._random_gains} for m in self._plan["actuator_models"]
+        ]
+        kinds = {"observation": self._plan["observations"], "control": self._plan["controls"], "actuator": models}
         named = [f"{kind} {t['name']}" for kind, terms in kinds.items() for t in terms if t["closed"] is closed]
         return named if closed else [*named, *(f"force data.{name}" for name in sorted(self._forces))]
 

@@ -13,6 +13,7 @@ from pydantic_core import to_jsonable_python
 
 from rlcli.config.schema import ActionConfig, ObservationConfig
 from rlcli.config.term_signatures import params_model
+from rlcli.deploy.actuator_formulas import actuator_models
 from rlcli.deploy.formulas import Formula, control_formula, given, observation_formula, op
 from rlcli.envs.direct import DirectEnv
 from rlcli.envs.managed import ManagedEnv
@@ -31,13 +32,18 @@ def describe(env: VecEnv) -> dict[str, Any]:
         ConfigError: if the terms of a direct task's `in_terms` do not fit the task.
     """
     parts = _describe_direct(env) if isinstance(env, DirectEnv) else _describe_managed(env)  # type: ignore[arg-type]
-    observations, controls = parts
+    observations, terms = parts
+    controls = _controls(env, terms)
+    if isinstance(env, DirectEnv) and not terms:
+        hook = f"{type(env.task).__name__}.pre_physics_step"
+        controls = [{"name": "actions", "func": hook, "ctrl": [], "actuators": [], "closed": False, "value": None}]
     commands = getattr(env, "command_manager", None)
     return {
         "joints": _joints(env),
         "actuators": _actuators(env),
         "observations": observations,
         "controls": controls,
+        "actuator_models": actuator_models(env, terms, controls),
         "commands": [
             {"name": term.name, "func": term.config.func, "size": term.instance.command.shape[1]}
             for term in (commands.terms if commands is not None else [])
@@ -48,8 +54,8 @@ def describe(env: VecEnv) -> dict[str, Any]:
     }
 
 
-def _describe_managed(env: ManagedEnv) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """Describe the terms of a manager-based environment: (group -> observation terms, action terms)."""
+def _describe_managed(env: ManagedEnv) -> tuple[dict[str, Any], list[BoundTerm]]:
+    """Describe the observations of a manager-based environment: (group -> observation terms), and its action terms."""
     groups = {}
     for group in env.config.observations:
         begin, terms = 0, []
@@ -60,13 +66,13 @@ def _describe_managed(env: ManagedEnv) -> tuple[dict[str, Any], list[dict[str, A
             terms.append(_observation(name, func, params, begin, width, pipeline.history, value))
             begin += pipeline.size
         groups[group] = terms
-    return groups, _controls(env, env.action_manager.terms)
+    return groups, env.action_manager.terms
 
 
-def _describe_direct(env: DirectEnv) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """Describe the observations and actions of a direct task: (group -> observations, actions).
+def _describe_direct(env: DirectEnv) -> tuple[dict[str, Any], list[BoundTerm]]:
+    """Describe the observations of a direct task: (group -> observations), and its actions as terms.
 
-    A direct task has formulas only if its method `in_terms` writes it as terms of `rlcli.mdp`.
+    A direct task has formulas, and actions as terms, only if its method `in_terms` writes it as terms of `rlcli.mdp`.
     """
     task, in_terms = env.task, env.task.in_terms()
     groups = {
@@ -77,10 +83,8 @@ def _describe_direct(env: DirectEnv) -> tuple[dict[str, Any], list[dict[str, Any
         )
         if width
     }
-    hook = f"{type(task).__name__}.pre_physics_step"
-    unknown = {"name": "actions", "func": hook, "ctrl": [], "actuators": [], "closed": False, "value": None}
     if in_terms is None:
-        return groups, [unknown]
+        return groups, []
     bound = {
         section: [_bind(env, section, number, entry) for number, entry in enumerate(in_terms.get(section, []))]
         for section in ("observations", "actions")
@@ -99,7 +103,7 @@ def _describe_direct(env: DirectEnv) -> tuple[dict[str, Any], list[dict[str, Any
         message = f"{type(task).__name__}.in_terms() {found}; list all terms in order"
         raise ConfigError([Problem("observations", "observations", message)])
     groups["policy"] = terms
-    return groups, _controls(env, bound["actions"])
+    return groups, bound["actions"]
 
 
 def _bind(env: DirectEnv, section: str, number: int, entry: Mapping[str, Any]) -> BoundTerm:

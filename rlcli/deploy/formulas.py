@@ -7,7 +7,8 @@ float32. A formula is one of these:
 - `{"field": NAME, "at": [...]}`: elements of a flattened field of MjData.
 - `{"given": NAME, "at": [...]}`: elements of an input. Inputs are `last_action`, `steps` (of the episode),
   `command/NAME` (a command of the task, such as a target velocity), `observation/NAME` (the value of an observation
-  term without a formula), and the policy's outputs `action` (raw) and `command` (with scale, offset and limits).
+  term without a formula), `target/NAME` (the target of an action term, for actuator models), and the policy's outputs
+  `action` (raw) and `command` (with scale, offset and limits).
 - `{"op": NAME, "of": [formulas]}`: an operation; `deployed/run_policy.py` implements all of them.
 
 A term without a formula can only be computed by its own code.
@@ -24,6 +25,7 @@ from rlcli.envs.vec_env import VecEnv
 from rlcli.managers.command import CommandTerm
 from rlcli.managers.term_binding import BoundTerm
 from rlcli.mdp import actions, observations
+from rlcli.mdp.term_helpers import column_numbers
 from rlcli.scene.entity import Entity
 from rlcli.sim.env_selection import Columns
 
@@ -49,6 +51,7 @@ def observation_formula(env: VecEnv, term: BoundTerm) -> Formula | None:
 def control_formula(env: VecEnv, term: BoundTerm, columns: tuple[int, int]) -> tuple[list[int], Formula] | None:
     """Return the indices in `MjData.ctrl` that an action term writes, and the formula of their values.
 
+    At a joint with an actuator model the value is the model's target, and the model computes the control from it.
     Return None if the term has no formula.
 
     Args:
@@ -58,12 +61,16 @@ def control_formula(env: VecEnv, term: BoundTerm, columns: tuple[int, int]) -> t
     """
     action = term.instance
     make = _ACTIONS.get(type(action).__name__) if _is_defined_in(actions, type(action)) else None
-    if make is None or None in action.actuators:
+    if make is None:
         return None
     value = make(action, list(range(*columns)))
-    gear = torch.tensor(env.engine.model.actuator_gear[action.actuators, 0], dtype=torch.float32)
+    motors = {joint: ctrl for m in action.entity.actuators for joint, ctrl in zip(m.joints, m.controls, strict=True)}
+    driven = column_numbers(action.joints, len(action.entity.joint_names))
+    ctrl = [motors[joint] if own is None else own for joint, own in zip(driven, action.actuators, strict=True)]
+    gear = torch.tensor(env.engine.model.actuator_gear[ctrl, 0], dtype=torch.float32)
     factor = 1.0 / gear if action.actuator == "motor" else gear
-    return list(action.actuators), op("mul", value, numbers(factor)) if bool((factor != 1.0).any()) else value
+    factor[[native is None for native in action.actuators]] = 1.0
+    return ctrl, op("mul", value, numbers(factor)) if bool((factor != 1.0).any()) else value
 
 
 def field(name: str, at: Any) -> Formula:

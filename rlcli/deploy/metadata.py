@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from rlcli.deploy.deployed_policy import DeployedPolicy
+from rlcli.errors import listing
 from rlcli.runs.checkpoint_reader import Checkpoint
 from rlcli.runs.layout_and_deployment import ActionColumns, DeploymentRecord, LayoutRecord, ObservationColumns
 from rlcli.runs.run import RECORD
@@ -52,8 +53,10 @@ def metadata_of(
             "action": output("the argument of env.step: the deterministic action, within +-`action_bound`"),
             "command": output(
                 "what reaches the actuators, in the `unit` of each term of `actions`: action x `scale` + `offset`,"
-                " clipped to `clip`, then to `limits`. If `command` of a term is 'task', this is the action clipped to"
-                " `clip`, and the task's own code computes the actuators' command from it"
+                " clipped to `clip`, then to `limits`. If `command` of a term is 'actuator model', this is the target"
+                " of the models in `deployment.actuator_models`, which compute forces or torques from it in every"
+                " physics step: it is no control of MuJoCo. If `command` of a term is 'task', this is the action"
+                " clipped to `clip`, and the task's own code computes the actuators' command from it"
             ),
         },
         "memory": [
@@ -70,10 +73,7 @@ def metadata_of(
             if spec.memory
         ],
         "observations": _with_columns(terms),
-        "actions": [
-            {**term, "command": "actuator" if term["scale"] is not None else "task"}
-            for term in _with_columns(layout.actions)
-        ],
+        "actions": [{**term, "command": _receiver(term, described)} for term in _with_columns(layout.actions)],
         "applied": {
             "before_obs": ["observations.modifiers", "observations.clip", "observations.scale", "observations.history"],
             "inside": [*(["normalizer"] if normalized else []), "action_bound"],
@@ -112,18 +112,47 @@ def required_inputs(metadata: dict[str, Any]) -> dict[str, int]:
 def terms_of_task_code(metadata: dict[str, Any]) -> list[str]:
     """Return one sentence for each term that `run_policy.py` cannot compute, because it has no formula."""
     deployment, sizes = metadata["deployment"] or {"observations": [], "controls": []}, required_inputs(metadata)
-    return [
-        f"run_policy.py cannot compute observation {term['name']}, which only the task's code computes: pass"
-        f" inputs['{term['value']['given']}'] ({sizes[term['value']['given']]} values of one step, with modifiers,"
-        " clip and scale applied)"
-        for term in deployment["observations"]
-        if not term["closed"]
-    ] + [
-        f"run_policy.py cannot compute the controls of action {term['name']}, which only the task's code computes:"
-        " compute them from Controller.command"
-        for term in deployment["controls"]
-        if not term["closed"]
-    ]
+    return (
+        [
+            f"run_policy.py cannot compute observation {term['name']}, which only the task's code computes: pass"
+            f" inputs['{term['value']['given']}'] ({sizes[term['value']['given']]} values of one step, with modifiers,"
+            " clip and scale applied)"
+            for term in deployment["observations"]
+            if not term["closed"]
+        ]
+        + [
+            f"run_policy.py cannot compute the controls of action {term['name']}, which only the task's code computes:"
+            " compute them from Controller.command"
+            for term in deployment["controls"]
+            if not term["closed"]
+        ]
+        + [
+            f"run_policy.py cannot compute the actuator model {model['name']} ({_obstacle(model)}): compute the efforts"
+            f" of {listing(model['joints'])} before every physics step"
+            for model in deployment.get("actuator_models", [])
+            if not model["closed"]
+        ]
+    )
+
+
+def _obstacle(model: dict[str, Any]) -> str:
+    """Return the reason for which an actuator model has no formula."""
+    if model["kind"] == "own":
+        return "a class of the task's code"
+    return "its targets are delayed" if any(model["delay"]) else "the task's code sets its targets"
+
+
+def _receiver(term: dict[str, Any], deployment: dict[str, Any] | None) -> str:
+    """Return what receives the command of an action term: `actuator`, `actuator model`, or `task` for its own code."""
+    if term["scale"] is None:
+        return "task"
+    deployment = deployment or {"controls": []}
+    driven = {ctrl for control in deployment["controls"] if control["name"] == term["name"] for ctrl in control["ctrl"]}
+    return (
+        "actuator model"
+        if any(driven & set(model["ctrl"]) for model in deployment.get("actuator_models", []))
+        else "actuator"
+    )
 
 
 def mjlab_properties(metadata: dict[str, Any], entity: str = "robot") -> dict[str, str]:

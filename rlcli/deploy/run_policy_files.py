@@ -54,6 +54,12 @@ _CHECK = """        sizes = SIZES
                 raise ValueError(f"{needed}; {way}")
 """
 """Lines that are inserted at the start of `Controller.act` for a policy that needs inputs."""
+_CHECK_SUBSTEPS = """        # remove this check if the drives of the robot compute the actuator models, with `targets`
+        if self.substeps < self.metadata["decimation"]:
+            names = ", ".join(model["name"] for model in self.plan["actuator_models"])
+            raise ValueError(f"call Controller.controls before every physics step: it computes the actuators {names}")
+"""
+"""Lines that are inserted at the start of `Controller.act` for a robot with actuator models."""
 _LOOP = "    policy, xml = "
 """Start of the program's simulation loop, which runs the policy with all commands zero."""
 _TOLERANCE = {"rtol": 1e-4, "atol": 1e-5}
@@ -75,6 +81,8 @@ def generate_program(policy: Path, model: Path, format_: str, metadata: dict[str
     # inserted last: nothing is substituted in names that come from the checkpoint
     if sizes := required_inputs(metadata):
         text = text.replace(_ACT, _ACT + _CHECK.replace("SIZES", literal(sizes)))
+    if (metadata["deployment"] or {}).get("actuator_models"):
+        text = text.replace(_ACT, _ACT + _CHECK_SUBSTEPS)
     if terms := terms_of_task_code(metadata):
         text = text[: text.index(_LOOP)] + f"    sys.exit({literal('error: ' + '; '.join(terms))})\n"
     return text

@@ -33,7 +33,7 @@ FIELDS = {
 """Fields of MjData that formulas may read."""
 _DAMAGED = "the manifest is damaged: use another checkpoint"
 _NO_LAYOUT = "the checkpoint does not describe the policy's columns, which this rlcli needs: train again"
-_INPUT_NAME = re.compile(r"last_action|steps|action|command|(command|observation)/.{1,1000}", re.DOTALL)
+_INPUT_NAME = re.compile(r"last_action|steps|action|command|(command|observation|target)/.{1,1000}", re.DOTALL)
 
 
 def check_formula(value: Any) -> None:
@@ -174,12 +174,36 @@ class ObservationFormula(_Formula):
 
 
 class ControlFormula(_Formula):
-    """Formula of an action term: it computes the elements `ctrl` of `MjData.ctrl` from `action` and `command`."""
+    """Formula of an action term: it computes the elements `ctrl` of `MjData.ctrl` from `action` and `command`.
+
+    At a joint with an actuator model (`ActuatorModelRecord`) it computes the target of the model.
+    """
 
     name: Name
     func: Name
     ctrl: Columns
     actuators: list[Name]
+    closed: bool
+    value: JsonValue
+
+
+class ActuatorModelRecord(_Formula):
+    """An actuator model: its formula computes the elements `ctrl` of `MjData.ctrl` before every physics step.
+
+    The formula reads the targets of the action terms, `target/NAME`, which hold for a whole control step.
+    """
+
+    name: Name
+    kind: Name
+    """pd, dc_motor, or own for a model of the task's code."""
+    joints: list[Name]
+    ctrl: Columns
+    stiffness: Numbers
+    damping: Numbers
+    effort_limit: list[float | None]
+    saturation_effort: float | None
+    velocity_limit: list[float | None] | None
+    delay: tuple[int, int]
     closed: bool
     value: JsonValue
 
@@ -218,6 +242,7 @@ class DeploymentRecord(_Record):
     actuators: list[ActuatorRecord]
     observations: dict[str, list[ObservationFormula]]
     controls: list[ControlFormula]
+    actuator_models: list[ActuatorModelRecord] = Field(default_factory=list)
     commands: list[CommandRecord]
     start: dict[Annotated[str, Field(pattern="^(qpos|qvel)$")], Numbers]
     forces_after_reset: bool
@@ -273,7 +298,7 @@ def deployment_of(checkpoint: Checkpoint, policy: Policy, found: object = None) 
     return record
 
 
-def deployment_differences(checkpoint: Checkpoint, layout: object, deployment: object, randomized: bool) -> list[str]:
+def deployment_differences(checkpoint: Checkpoint, layout: object, deployment: Any, randomized: bool) -> list[str]:
     """Return the keys in which the layout and deployment records of a checkpoint and an environment differ.
 
     Formulas are not compared.
@@ -285,6 +310,9 @@ def deployment_differences(checkpoint: Checkpoint, layout: object, deployment: o
         randomized: do not compare gains and the start state, because the task randomises them.
     """
     saved_layout, saved = checkpoint.manifest.get("layout"), checkpoint.manifest.get("deployment")
+    if saved is not None and "actuator_models" not in saved and deployment["actuator_models"]:
+        # written by an rlcli without formulas for actuator models
+        saved, deployment = ({**r, "controls": [], "actuator_models": []} for r in (saved, deployment))
     found = list(_differing_keys(saved_layout, layout, "layout"))
     if saved is not None:
         before, now = (_comparable_parts(description, randomized) for description in (saved, deployment))
@@ -302,7 +330,8 @@ def _comparable_parts(deployment: Any, randomized: bool) -> dict[str, Any]:
     gains = ("default", "stiffness", "damping") if randomized else ()
     joints = [_without_values(joint, *gains) for joint in deployment["joints"]]
     controls = [_without_values(term) for term in deployment["controls"]]
-    return {"observations": terms, "controls": controls, "joints": joints, **rest}
+    models = [_without_values(model) for model in deployment.get("actuator_models", [])]
+    return {"observations": terms, "controls": controls, "actuator_models": models, "joints": joints, **rest}
 
 
 def _without_values(entry: Mapping[str, Any], *randomized: str) -> dict[str, Any]:

@@ -49,12 +49,13 @@ class ActuatorModel(TensorState):
         """Index that selects the driven joints in tensors with one column for each joint of the entity."""
         names = [entity.joint_names[j] for j in self.joints]
         motors = dict(entity.actuators_of("motor"))
-        controls = [motors[j] for j in self.joints]
-        self._gear = torch.tensor(engine.model.actuator_gear[controls, 0], dtype=torch.float32, device=device)
+        self.controls = [motors[j] for j in self.joints]
+        """Index in MuJoCo's `ctrl` of each joint's motor."""
+        self._gear = torch.tensor(engine.model.actuator_gear[self.controls, 0], dtype=torch.float32, device=device)
         self._qpos, self._qvel, self._ctrl = engine.field("qpos"), engine.field("qvel"), engine.field("ctrl")
         self._qpos_columns = as_index(entity.qpos_columns[self.joints].tolist(), device)
         self._dof_columns = as_index(entity.dof_columns[self.joints].tolist(), device)
-        self._controls = as_index(controls, device)
+        self._controls = as_index(self.controls, device)
         k = len(self.joints)
         self.stiffness = values_by_joint(config.stiffness, names).to(device).expand(n, -1).clone()
         """Stiffness of each joint's controller. (num_envs, k) [N/m or N m/rad]"""

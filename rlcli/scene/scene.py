@@ -122,6 +122,10 @@ class Scene:
             for option in _OPTIONS:
                 if hasattr(child.option, option):
                     setattr(self.spec.option, option, getattr(child.option, option))
+        # MuJoCo keeps the options of the scene, and would warn of each that differs in the model
+        for option in dir(child.option):
+            if not option.startswith("_"):
+                setattr(child.option, option, getattr(self.spec.option, option))
         for key in list(child.keys):
             child.delete(key)  # a keyframe of one entity has a wrong size in a scene with several entities
         self.spec.memory = max(self.spec.memory, child.memory)

@@ -17,7 +17,11 @@ import pytest
 
 from rlcli.cli.app import main
 from rlcli.deploy import run_policy_files
+from rlcli.deploy.closed_loop import open_reference
 from rlcli.errors import UsageError
+from rlcli.runs.checkpoint_reader import open_checkpoint
+from rlcli.runs.policy_ref import Choice
+from rlcli.runs.run import open_run
 from rlcli.runs.run_ref import find_checkpoint
 
 PUSHED = """
@@ -378,7 +382,7 @@ def test_program_is_short_and_runs_without_rlcli(newest, tmp_path, capfd, format
     run, suffix = newest("cartpole").parent.parent, {"onnx": ".onnx", "numpy": ".py"}[format_]
     verify(capfd, run, tmp_path / f"policy{suffix}", "--format", format_, "--episodes", "2")
     file = tmp_path / "run_policy.py"
-    assert len(file.read_text().splitlines()) <= 80
+    assert len(file.read_text().splitlines()) <= 95
     assert max(map(len, file.read_text().splitlines())) <= 120
     blocked = ["rlcli", "rlcli_tasks", "torch", "pydantic", *(["onnxruntime"] if format_ == "numpy" else [])]
     command = [sys.executable, "-B", "-c", PROGRAM.format(blocked=blocked), str(file), "60"]
@@ -455,3 +459,31 @@ def test_names_of_inputs_stay_literals_in_generated_program():
     texts = [node.value for node in ast.walk(ast.parse(program)) if isinstance(node, ast.Constant)]
     assert f"observation/{name}" in texts
     assert any(str(text).startswith(f"error: run_policy.py cannot compute observation {name}") for text in texts)
+
+
+def test_verify_builds_no_more_environments_than_episodes(pushed):
+    folder = find_checkpoint(str(pushed), pushed.parent)[1]
+    choice = Choice(folder, "as named", open_run(pushed), None)
+    sizes = [open_reference(choice, open_checkpoint(folder), None, n).env.num_envs for n in (1, 3, 64)]
+    assert sizes == [2, 3, 6]  # the run has 6; with one, random values would look like constants
+
+
+def test_progress_of_verify_names_its_phases_and_never_decreases(newest, tmp_path, capfd, monkeypatch):
+    monkeypatch.setattr("rlcli.cli.ui.progress_view._WORK_LINE_EVERY_S", 0.02)
+    run = newest("cartpole").parent.parent
+    arguments = ["export", "--checkpoint", str(run), "--output", str(tmp_path / "policy.py"), "--format", "numpy"]
+    assert main([*arguments, "--verify", "--episodes", "8"]) == 0
+    lines = [line for line in capfd.readouterr().err.splitlines() if " of 3: " in line]
+    phases = [re.search(r"(\d of 3: [\w ]+)", line)[1] for line in lines]
+    assert list(dict.fromkeys(phases)) == ["1 of 3: evaluation", "2 of 3: plain MuJoCo"]
+    shares = [int(found[1]) for line in lines if (found := re.search(r" (\d+)%", line))]
+    assert shares == sorted(shares)
+    assert 33 < shares[-1] <= 67
+
+
+def test_export_without_verify_says_nothing_about_the_program_it_does_not_write(pushed, tmp_path, capfd):
+    arguments = ["export", "--checkpoint", str(pushed), "--format", "numpy"]
+    assert main([*arguments, "--output", str(tmp_path / "a" / "policy.py")]) == 0
+    assert "run_policy.py" not in capfd.readouterr().err
+    assert main([*arguments, "--output", str(tmp_path / "b" / "policy.py"), "--verify", "--episodes", "2"]) == 0
+    assert "run_policy.py cannot compute observation own" in capfd.readouterr().err

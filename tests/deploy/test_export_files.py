@@ -175,6 +175,7 @@ SCHEMA = {
         "controls": [
             {"name": str, "func": str, "ctrl": list, "actuators": list, "closed": bool, "value": dict}
         ],
+        "actuator_models": list,
         "commands": list, "start": {"qpos": list, "qvel": list}, "forces_after_reset": bool, "derived": str,
     },
     "normalizer": bool, "action_bound": float, "step_dt": float, "dt": float, "decimation": int, "quaternions": str,

@@ -476,3 +476,13 @@ def test_models_in_the_cache_of_mujoco_menagerie(tmp_path, monkeypatch):
             model_file(tmp_path, missing)
     with pytest.raises(TaskError, match="outside"):
         model_file(tmp_path, "models:arm/../../x.xml")
+
+
+def test_options_of_models_cause_no_warning(tmp_path):
+    slow = PENDULUM.replace("<worldbody>", '<option timestep="0.005" gravity="0 0 -5" iterations="3"/>\n<worldbody>', 1)
+    write(tmp_path, PENDULUM_TASK, pendulum_xml=slow)
+    with warnings.catch_warnings(action="error"):
+        scene = build(tmp_path).spec
+        text = scene.to_xml()
+    assert 'iterations="3"' in text
+    assert 'gravity="0 0 -5"' not in text

@@ -16,7 +16,8 @@ from rlcli.errors import TaskError, UsageError, listing
 from rlcli.registry.find import path_of
 
 if TYPE_CHECKING:
-    from rlcli.deploy.closed_loop import ClosedLoopResult, ReferenceEnv
+    from rlcli.deploy.closed_loop import ReferenceEnv
+    from rlcli.deploy.closed_loop_result import ClosedLoopResult
     from rlcli.deploy.export import Exported
     from rlcli.runs.checkpoint_reader import Checkpoint
     from rlcli.runs.policy_ref import Choice
@@ -66,9 +67,9 @@ def command(
     if format == BUNDLE:
         _export_bundle(saved, chosen.run, file)
         return
-    reference = _open_reference(chosen, saved, file, task) if verify else None
+    reference = _open_reference(chosen, saved, file, task, episodes) if verify else None
     done = export(saved, file, format, None if reference is None else reference.deployment)
-    _print_exported(done)
+    _print_exported(done, verify)
     result = None if reference is None else _verify(reference, saved, done, format, episodes)
     entries = {"observations": done.observations, "max_difference": done.max_difference, "metadata": done.metadata}
     verified = None if result is None else result.record()
@@ -77,16 +78,16 @@ def command(
         raise typer.Exit(9)
 
 
-def _print_exported(done: Exported) -> None:
+def _print_exported(done: Exported, verify: bool) -> None:
     """Print the largest difference between the actions of the exported file and of the policy.
 
-    Also warn of observation and action terms that only the task's code can compute.
+    With `verify`, also warn of observation and action terms that run_policy.py cannot compute.
     """
     from rlcli.deploy.metadata import terms_of_task_code
 
     limit = f"difference <= {done.max_difference:.1e}"
     console.info(f"the exported file equals the policy on {done.observations} observations: {limit}")
-    for sentence in terms_of_task_code(done.metadata):
+    for sentence in terms_of_task_code(done.metadata) if verify else []:
         console.warn(sentence)
 
 
@@ -103,7 +104,7 @@ def _default_file(choice: Choice, format_: str) -> Path:
     return choice.run.folder / "exports" / f"policy{FORMATS.get(format_, '')}"
 
 
-def _open_reference(choice: Choice, saved: Checkpoint, file: Path, task: str | None) -> ReferenceEnv:
+def _open_reference(choice: Choice, saved: Checkpoint, file: Path, task: str | None, episodes: int) -> ReferenceEnv:
     from rlcli.deploy.closed_loop import open_reference
     from rlcli.deploy.run_policy_files import check_overwrites
     from rlcli.runs.trusted_tasks import named_task
@@ -121,7 +122,7 @@ def _open_reference(choice: Choice, saved: Checkpoint, file: Path, task: str | N
             raise
         hint = f"leave out the task, which the run names: rlcli export --checkpoint {choice.run.folder} --verify"
         raise TaskError(error.message, hint=hint) from None
-    return open_reference(choice, saved, named)
+    return open_reference(choice, saved, named, episodes)
 
 
 def _verify(

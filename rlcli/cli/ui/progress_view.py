@@ -114,7 +114,7 @@ def work_line(running: Sequence[Work]) -> str:
         running: parts of the command that are being done now, the outermost first; parts of several threads are mixed.
     """
     works = list(running)
-    counts = [f"{work.what} {work.done:,}/{work.total:,}" if work.total else work.what for work in works]
+    counts = [work.text() for work in works]
     counted = [work for work in works if work.total]
     threads: dict[int, list[Work]] = {}
     for work in counted:
