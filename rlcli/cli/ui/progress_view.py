@@ -143,6 +143,8 @@ def _share(nested: Sequence[Work]) -> float:
     share = 0.0
     for work in reversed(nested):
         share = max(work.fraction(), (work.done + share) / (work.total or 1))
+    if len(nested) > 1:
+        nested[0].share = share  # it does not fall while one part has ended and the next has not begun
     return share
 
 
