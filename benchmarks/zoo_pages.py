@@ -212,7 +212,7 @@ def index(zoo: Path, found: list[Any]) -> str:
         "",
         "After reading this page you can choose a task to start from. `rlcli play TASK` shows the policy that comes",
         "with a task, and `rlcli train TASK` trains a new one. A task's page has its model, parameters, learning",
-        "curves and results.",
+        "curves and results. Go1 and G1 are in a plugin: [Train robots of MuJoCo Menagerie](../../guides/menagerie.md).",
         "",
         "```{toctree}",
         ":hidden:",
