@@ -214,6 +214,8 @@ def index(zoo: Path, found: list[Any]) -> str:
         "with a task, and `rlcli train TASK` trains a new one. A task's page has its model, parameters, learning",
         "curves and results.",
         "",
+        "Go1 and G1 are in a plugin: see [Train robots of MuJoCo Menagerie](../../guides/menagerie.md).",
+        "",
         "```{toctree}",
         ":hidden:",
         "",

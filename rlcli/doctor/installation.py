@@ -4,6 +4,7 @@ import platform
 import re
 import sys
 import threading
+from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
 
@@ -60,6 +61,8 @@ def entry_checks(group: str, timeout_s: float, stop: threading.Event) -> list[Ch
         state, hint = "ok", None
         if row.broken:
             state, hint = "broken", row.remedy or _remedy(entry, row.broken)
+            if _is_late(row.broken):
+                state, row = "warning", replace(row, broken=f"slow: {row.broken}")
         elif owners:
             state, hint = "warning", f"{owners} has a task of the same name; write {entry.qualified}"
         text = f"{entry.distribution} {entry.version}: {row.broken or row.summary or 'loads'}"
@@ -204,8 +207,13 @@ def _remedy(entry: Entry, reason: str) -> str:
     """
     if entry.distribution == "rlcli":
         return pip_install("--force-reinstall --no-deps rlcli")
-    late = "; if the machine is busy: `rlcli doctor --probe-timeout 120`" if " within " in reason else ""
-    return f"pip uninstall {entry.distribution}, or exclude it with RLCLI_PLUGINS; report it to its authors{late}"
+    late = "if the machine is busy: `rlcli doctor --probe-timeout 120`; else " if _is_late(reason) else ""
+    return f"{late}pip uninstall {entry.distribution}, or exclude it with RLCLI_PLUGINS; report it to its authors"
+
+
+def _is_late(reason: str) -> bool:
+    """Return whether a plugin counts as broken only because it exceeded the time limit of its load."""
+    return reason.startswith(("did not load within ", "not loaded, because "))
 
 
 def _other_owners(entry: Entry, entries: list[Entry]) -> str:

@@ -13,6 +13,7 @@ from rlcli.config.layers import leaves
 from rlcli.config.messages import dotted
 from rlcli.errors import ConfigError, Problem, UsageError, listing
 from rlcli.evaluation.session import POLICIES, PolicyInTask, PolicyRequest, baseline, find_policy, make_actor
+from rlcli.progress import tracked
 from rlcli.safe_text import shorten
 
 if TYPE_CHECKING:
@@ -119,7 +120,10 @@ def compare(names: Sequence[str], policies: Sequence[PolicyInTask], episodes: in
 
     first = policies[0]
     task = one_each(first.resolved, episodes)
-    found = [run_points(task, make_actor(policy), [], [None], episodes, first.seed)[0] for policy in policies]
+    found = [
+        run_points(task, make_actor(policy), [], [None], episodes, first.seed)[0]
+        for policy in tracked(policies, "policies", len(policies))
+    ]
     return Comparison(
         list(names),
         list(policies),

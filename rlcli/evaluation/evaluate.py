@@ -148,6 +148,7 @@ def evaluate(
             if step.episodes is not None:
                 _add_episodes(result, step.episodes.ended(), quota, means)
             steps += 1
+            work.what = f"step {steps:,} of at most {longest:,}, episodes"
             work.update(len(result.returns), steps / longest)  # several episodes may end in the same step
         env.check()
     after = {cause: count - before.get(cause, 0) for cause, count in env.causes.items()}

@@ -173,7 +173,8 @@ def run_points(
     size = resolved.task.scene.num_envs
     at_once = max(1, MAX_ENVS // size)
     results: list[Evaluation] = []
-    for start in tracked(range(0, len(points), at_once), "batches of variants", -(-len(points) // at_once)):
+    starts = range(0, len(points), at_once)
+    for start in starts if len(starts) == 1 else tracked(starts, "batches of variants", len(starts)):
         batch = points[start : start + at_once]
         seed_generators(derive(seed, "task"))  # some tasks draw from torch's, numpy's or Python's generator
         batched, env_seed = resolved.with_num_envs(size * len(batch)), derive(seed, "evaluation")

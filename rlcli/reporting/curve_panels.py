@@ -24,7 +24,7 @@ _TITLES = {
     _EVALUATED: ("Success in evaluations", "share of episodes, no exploration noise"),
     "Train/mean_episode_length": ("Episode length", "environment steps"),
 }
-_REWARD_UNIT = "mean reward per second"
+_REWARD_UNIT = "sum over an episode / full episode length [s]"
 _ENDS_UNIT = "share of episodes"
 _SHARES = ("success_rate",)
 

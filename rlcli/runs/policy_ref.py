@@ -15,7 +15,7 @@ from rlcli.runs.checkpoint_reader import Checkpoint
 from rlcli.runs.policy_bundle import is_bundle, open_bundle
 from rlcli.runs.restore import recorded_task, source_of
 from rlcli.runs.run import Run
-from rlcli.runs.run_ref import find_checkpoint, list_runs
+from rlcli.runs.run_ref import find_checkpoint, is_same_task, list_runs
 
 SHIPPED = "shipped"
 """Word that refers to the policy which comes with a task, as in `--checkpoint shipped`."""
@@ -86,7 +86,7 @@ def choose(
     if reference is not None and is_bundle(path_of(reference)):
         found = open_bundle(Path(reference))
         owner = found.manifest["task"]["name"]
-        if name is not None and owner != name:
+        if name is not None and not is_same_task(owner, name):
             raise UsageError(f"{reference} is a policy for {owner}, not for {name}", hint="leave out the task")
         return Choice(found.folder, "as named", None, found)
     run, folder, why = find_checkpoint(reference or "latest", runs_dir, name)

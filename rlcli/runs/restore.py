@@ -30,7 +30,7 @@ def source_of(run: Run, named: TaskSource | None = None) -> TaskSource:
     Args:
         run: the run.
         named: the task on the command line. It replaces the recorded task if both are folders or files, for example
-            after the task's folder was moved. None: no task was named.
+            after the task's folder was moved, or if the recorded task is not on this machine. None: no task was named.
 
     Raises:
         TaskError: if the task is not installed any more.
@@ -60,8 +60,13 @@ def recorded_task(
     owner = record.get("distribution")
     try:
         if owner:
-            return installed_task(find_entry(TASKS, f"{owner}:{record['name']}", what="task"))
-        if named is not None and named.distribution is None:
+            try:
+                return installed_task(find_entry(TASKS, f"{owner}:{record['name']}", what="task"))
+            except TaskError:
+                if named is None:
+                    raise
+                return named
+        if named is not None and (named.distribution is None or not Path(str(record.get("folder"))).is_dir()):
             return named
         if not trusted_tasks.is_known(record):
             raise _untrusted_code_error(record, what, run)
@@ -71,7 +76,8 @@ def recorded_task(
         return folder_task(Path(str(record["folder"])), file)
     except TaskError as error:
         version = f" {record['version']}" if record.get("version") else ""
-        hint = f"if you trust its authors, install {owner}{version}" if owner else error.hint
+        folder = "" if run is None else f"; or name its folder: rlcli play FOLDER --checkpoint {shlex.quote(run)}"
+        hint = f"if you trust its authors, install {owner}{version}{folder}" if owner else error.hint
         raise TaskError(f"{what} is not installed: {error.message}", hint=hint) from None
 
 

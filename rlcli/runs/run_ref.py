@@ -31,9 +31,14 @@ def find_run(reference: str, runs_dir: Path, task: str | None = None) -> tuple[R
         UsageError: if the run is of another task than `task`.
     """
     run, why = _find_run(reference, runs_dir, task)
-    if task is not None and run.record["task"]["name"] != task:
+    if task is not None and not is_same_task(run.record["task"]["name"], task):
         raise UsageError(f"{run.folder} is a run of {run.record['task']['name']}, not of {task}", hint="leave out TASK")
     return run, why
+
+
+def is_same_task(name: str, other: str) -> bool:
+    """Return whether two names may be of one task: `pick-crane` is installed, and its folder is `pick_crane`."""
+    return name.replace("-", "_") == other.replace("-", "_")
 
 
 def is_checkpoint_ref(reference: str) -> bool:

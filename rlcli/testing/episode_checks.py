@@ -5,6 +5,7 @@ Each function checks one requirement that every task must meet.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
 
@@ -100,6 +101,14 @@ def start_states(subject: TaskUnderTest) -> Iterator[Finding]:
     if equal_values(first, second):
         message = "two episodes in a row start in the same states; they must vary"
         yield error_at("between episodes", message, hint)
+    with contextlib.suppress(Exception):  # other checks report the error of a step
+        env.step(torch.zeros(env.num_envs, env.layout.action_size))
+        held = [name for name, share in env.condition_shares().items() if share == 1.0]
+        if held:
+            subject.notes["start-states"] = (
+                f"success: {', '.join(held)} holds already after the first step in all {env.num_envs} environments:"
+                " right for a state to keep, but wrong for a goal to reach"
+            )
 
 
 def _start(env: VecEnv, obs: dict[str, Tensor]) -> Tensor:

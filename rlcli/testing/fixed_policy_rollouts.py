@@ -17,6 +17,7 @@ from torch import Tensor
 from rlcli.envs.managed import ManagedEnv
 from rlcli.envs.observers import StepObserver
 from rlcli.envs.vec_env import VecEnv
+from rlcli.progress import tracked
 from rlcli.testing.steps import EndedEpisode, ended_episodes
 from rlcli.testing.task_under_test import TaskUnderTest, element_names
 
@@ -121,7 +122,7 @@ def record_rollout(env: VecEnv, policy: str, bound: float, steps: int) -> Rollou
     with env.observers.added(physics):
         try:
             _append(obs, env.reset(seed=env.seed))
-            for step in range(steps):
+            for step in tracked(range(steps), f"policy {policy}, steps", steps):
                 action = act(step)
                 result = env.step(action)
                 done = result.terminated | result.truncated
@@ -224,7 +225,8 @@ class RolloutEvidence:
         """One rollout of each policy of `FIXED_POLICIES`; recorded when it is first read."""
         if self._rollouts is None:
             bound = self.subject.bound
-            self._rollouts = [record_rollout(self.env(), name, bound, self.steps) for name in FIXED_POLICIES]
+            names = tracked(FIXED_POLICIES, "policies", len(FIXED_POLICIES))
+            self._rollouts = [record_rollout(self.env(), name, bound, self.steps) for name in names]
         return self._rollouts
 
     @property

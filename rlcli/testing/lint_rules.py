@@ -22,6 +22,7 @@ from rlcli.testing.angle_rules import degrees, joint_limits
 from rlcli.testing.findings import task_error_text
 from rlcli.testing.fixed_policy_rollouts import FIXED_POLICIES, MAX_STEPS, RolloutEvidence, record_rollout
 from rlcli.testing.remarks import Remark, error_at, warning_at
+from rlcli.testing.start_rules import start_pose_falls
 from rlcli.testing.task_under_test import observation_parts
 from rlcli.testing.timestep_checks import energy_drift
 
@@ -378,7 +379,7 @@ def discount_of(agent: AgentConfig | None) -> float | None:
 
 _IN_ORDER: tuple[Callable[[RolloutEvidence], Iterable[Remark]], ...] = (
     *(stops, early_resets, silent_reward, dominant_reward, constant_reward, dying_pays, constant_observation),
-    *(observation_scale, saturated_actions, dead_action, timestep, horizon, degrees, joint_limits),
+    *(observation_scale, saturated_actions, dead_action, timestep, horizon, degrees, joint_limits, start_pose_falls),
 )
 RULES = {rule.__name__.replace("_", "-"): rule for rule in _IN_ORDER}
 """Name -> rule, in the order in which they run; `docs/guides/check-and-lint.md` lists them.

@@ -123,6 +123,8 @@ class TrainLoop:
             metrics["Perf/iteration_time"], begin = now - begin, now
             for logger in self.loggers:
                 logger.write(trainer.iteration, trainer.env_steps, metrics)
+            if self.periodic_eval is not None and evaluation:
+                _log.info("evaluation after iteration %s: %s", trainer.iteration, self.periodic_eval.text)
             self._check_health(metrics)
             self.show(self._progress(budget, metrics))
             if must_save or writer.is_due(trainer.iteration, self.save_interval):
@@ -226,6 +228,9 @@ class TrainLoop:
         trainer = self.trainer
         self._recent.append({**metrics, "iteration": trainer.iteration, "step": trainer.env_steps})
         progress = progress_from_metrics([*self._recent], budget.iterations(trainer))
+        last_evaluation = next((row for row in reversed(self._recent) if "Eval/mean_reward" in row), {})
+        progress.metrics |= {name: value for name, value in last_evaluation.items() if name.startswith("Eval/")}
+        progress.may_end_earlier = self.periodic_eval is not None and self.periodic_eval.until is not None
         progress.notes = [] if self.health is None else [*self.health.notes(metrics), *self.run.findings()]
         return progress
 

@@ -43,6 +43,8 @@ class PeriodicEval:
         until: Threshold | None = None,
     ) -> None:
         self.until, self.reached = until, False
+        self.text = ""
+        """Result of the newest evaluation, as text for the user."""
         self._make_env, self._episodes, self._interval = make_env, episodes, interval
         self._env: Environment | None = None
         self._initial_state: Mapping[str, Tensor] = {}
@@ -71,6 +73,7 @@ class PeriodicEval:
             self._env.load_state_dict(self._initial_state)
             seed_generators(self._env.seed)
             summary = evaluate(self._env, trained_policy(self._env, policy()), self._episodes).summary()
+        self.text = _text(summary, self.until)
         self.reached = self.until is not None and self.until.is_certain(summary)
         metrics = {_RETURN: summary["return"]["mean"], _LENGTH: summary["length"]["mean"]}
         return {**metrics, _SUCCESS: summary["success"]["rate"]} if "success" in summary else metrics
@@ -85,3 +88,14 @@ class PeriodicEval:
 def _score(metrics: Mapping[str, Any]) -> tuple[float, float]:
     """Return (success rate, mean return) of an evaluation, to compare evaluations; -inf for a missing metric."""
     return metrics.get(_SUCCESS, -math.inf), metrics.get(_RETURN, -math.inf)
+
+
+def _text(summary: Mapping[str, Any], until: Threshold | None) -> str:
+    """Return the result of an evaluation as text: success, else return, and the value that `until` compares."""
+    key = until.key if until is not None and until.key in summary else "success" if "success" in summary else "return"
+    value, low = (summary[key][name] for name in ("rate" if key == "success" else "mean", "low"))
+    text = f"{key} {value:.1%}" if key == "success" else f"{key} {value:.4g}"
+    text += f" of {summary['episodes']} episodes, without exploration noise"
+    if until is None or low is None:
+        return text
+    return f"{text}; lower end of the 95 % interval {low:.3g}, {until.key}={until.value:g} is needed"

@@ -5,12 +5,14 @@ The module imports neither torch nor MuJoCo.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 PARTS = ("physics", "task", "policy", "update")
 """Parts of an iteration whose durations are measured."""
+_RETURN = "Train/mean_reward"
 _FOREVER_S = 1e10
 """Largest remaining time that is displayed [s]; a longer one counts as unknown."""
 
@@ -29,6 +31,10 @@ class Progress:
     seconds: dict[str, float]
     """Part of an iteration -> its duration [s], or its share of the iteration."""
     metrics: dict[str, float]
+    no_episode: str = ""
+    """Note that no episode has ended in the newest iterations, so `Train/*` are of older episodes; empty if one has."""
+    may_end_earlier: bool = False
+    """Whether the training may end before its budget, because of a threshold (`--until`)."""
     notes: Sequence[str] = ()
     """Conditions of success with their values, and findings of the health checks."""
 
@@ -53,7 +59,25 @@ def progress_from_metrics(rows: Sequence[Mapping[str, Any]], iterations: int | N
         left = max(0, iterations - last["iteration"]) * duration / len(newer)
         left = left if left < _FOREVER_S else None
     seconds = {part: _number(last, f"Perf/{part}_share") for part in PARTS}
-    return Progress(last["iteration"], iterations, last["step"], left, rate, seconds, metrics)
+    note = no_episode_note(rows)
+    return Progress(last["iteration"], iterations, last["step"], left, rate, seconds, metrics, note)
+
+
+def no_episode_note(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return a note if no episode has ended in the newest iterations; empty if one has ended in the last.
+
+    An iteration in which episodes have ended has metrics `Episode_*`; without them, `Train/*` repeat older values.
+
+    Args:
+        rows: rows of `metrics.jsonl`, at least one, the oldest first.
+    """
+    if _RETURN not in rows[-1]:
+        return "no episode has ended yet"
+    newest = itertools.takewhile(lambda row: not any(name.startswith("Episode_") for name in row), reversed(rows))
+    count = sum(1 for row in newest if row.get(_RETURN) == rows[-1][_RETURN])
+    least = "at least " if count == len(rows) else ""
+    text = f"no episode ended for {least}{count} iteration{'s' * (count != 1)}, so the figures are older"
+    return text if count else ""
 
 
 def _iteration_s(row: Mapping[str, Any]) -> float:

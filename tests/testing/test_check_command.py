@@ -196,3 +196,12 @@ def test_unused_plugin_imports_nothing_heavy(tmp_path):
     )
     code, output = run_pytest(tmp_path, test, "-W", "error")
     assert code == 0, output
+
+
+@pytest.mark.parametrize(("at_most", "noted"), [(3.2, True), (0.001, False)])
+def test_note_names_a_condition_of_success_that_holds_from_the_start(managed, capsys, at_most, noted):
+    managed.config["success"] = {"upright": {"func": "joint_error", "joints": ["hinge"], "at_most": at_most}}
+    code, out, _ = check(capsys, managed.write(), "--only", "start-states")
+    assert code == 0
+    note = "note: start-states: success: upright holds already after the first step in all 8 environments"
+    assert (note in out) is noted

@@ -55,6 +55,45 @@ def test_early_resets_finds_direct_task_done_at_start(direct):
     assert rules(direct)["early-resets"].where == "terminations: task"
 
 
+FLOATING = """<mujoco>
+  <worldbody>
+    <geom type="plane" size="5 5 0.1"/>
+    <body name="base" pos="0 0 1">
+      <freejoint/>
+      <geom type="box" size="{size}" mass="1"/>
+      <body name="link" pos="0 0 0.1">
+        <joint name="hinge" axis="0 1 0" damping="0.1" range="-1 1"/>
+        <geom type="capsule" fromto="0 0 0 0 0 0.2" size="0.02" mass="0.2" contype="0" conaffinity="0"/>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize(
+    ("size", "func", "falls"),
+    [
+        ("0.02 0.02 0.2", "joint_position", True),
+        ("0.3 0.3 0.2", "joint_position", False),
+        ("0.02 0.02 0.2", "joint_effort", False),
+    ],
+)
+def test_start_pose_falls_finds_a_robot_that_its_default_pose_does_not_hold(managed, size, func, falls):
+    managed.xml = FLOATING.format(size=size)
+    config = managed.config
+    config["scene"]["entities"]["robot"] = {"model": "pendulum.xml", "pos": [0.0, 0.0, 0.2]}
+    config["scene"]["entities"]["robot"]["joints"] = {"hinge": {"kp": 20.0, "kv": 1.0, "effort_limit": 5.0}}
+    config["actions"] = {"legs": {"func": func, "joints": ["hinge"]}}
+    config["events"] = {"start": {"func": "reset_root_state_uniform", "mode": "reset", "roll": [0.2, 0.3]}}
+    config["terminations"]["tilted"] = {"func": "bad_orientation", "limit_angle": 0.6}
+    found = [remark for remark in lint(managed, only=["start-pose-falls"]) if remark.rule == "start-pose-falls"]
+    assert bool(found) is falls
+    if falls:
+        assert "by tilted" in found[0].message
+        assert found[0].severity == "warning"
+
+
 def test_degrees_finds_angles_that_are_too_large_for_radians(managed):
     managed.config["terminations"]["tilted"] = {"func": "bad_orientation", "limit_angle": 35}
     managed.config["events"]["root"] = {"func": "reset_root_state_uniform", "mode": "reset", "pitch": [-8.0, 8.0]}

@@ -1,6 +1,7 @@
 """Tests of evaluations between iterations: they choose the best checkpoint and do not change training."""
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -44,6 +45,7 @@ def weights(run):
 @pytest.mark.parametrize(("task", "agent"), [("cartpole", "sb3-ppo"), ("cartpole-direct", "ppo")])
 def test_evaluation_does_not_change_training(task, agent, capsys):
     words = ("--agent", agent, "--max-iterations", "4", "episode_length_s=0.3", "agent.eval_episodes=4")
+    words += ("success.pole.hold_s=0",)
     plain = train(task, "plain", *words)
     with_eval = train(task, "with_eval", *words, "agent.eval_interval=2")
     assert weights(plain) == weights(with_eval)
@@ -97,3 +99,14 @@ def test_success_rate_counts_before_return():
     assert not evaluator.improves({"Eval/success_rate": 0.5, "Eval/mean_reward": 9.0})
     assert evaluator.improves({"Eval/success_rate": 0.5, "Eval/mean_reward": 9.5})
     assert evaluator.improves({"Eval/success_rate": 0.6, "Eval/mean_reward": 1.0})
+
+
+def test_each_evaluation_prints_a_line_with_the_value_that_until_compares(capsys):
+    words = [*SMALL, "episode_length_s=1.0", "agent.eval_interval=2", "agent.eval_episodes=8"]
+    words.remove("-q")
+    assert main(["train", "cartpole", *words, "--max-iterations", "4", "--until", "return=1000"]) == 0
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("evaluation after")]
+    assert [line.split(":")[0] for line in lines] == ["evaluation after iteration 2", "evaluation after iteration 4"]
+    result = re.compile(r": return -?[\d.]+ of 8 episodes, without exploration noise; lower end")
+    assert all(map(result.search, lines))
+    assert lines[0].endswith("return=1000 is needed")

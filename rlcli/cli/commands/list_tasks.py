@@ -49,8 +49,10 @@ def command(
     rows = [(entry, details.get(entry.qualified, Details())) for entry in entries]
     if rows or not pattern:
         _show(rows, shared)
+        for remedy in dict.fromkeys(known.remedy for _, known in rows if known.broken and known.remedy):
+            console.info(f"for a broken task: {remedy}")
         if any(known.broken for _, known in rows) and not probe_all:
-            console.info("after a repair, load broken tasks again: rlcli list-tasks --probe")
+            console.info("the states are of the last load; after a repair, load again: rlcli list-tasks --probe")
     else:
         near = did_you_mean(pattern.lower(), by_name)
         console.info(f"no task's name or summary contains '{pattern}'; {near or 'rlcli list-tasks shows all'}")

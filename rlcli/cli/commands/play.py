@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from rlcli.evaluation.session import Session
 
 _FALLBACK_VIDEO = "play.mp4"
-_VIDEO_ENVS = 16
-"""Number of environments of a video, if neither the user nor the task's `play:` sets it."""
+_USUAL_ENVS = 16
+"""Number of environments of a video and of printed values, if neither the user nor the task's `play:` sets it."""
 _MIN_VIDEO_S = 5.0
 """Shortest video [s] that may end with a terminated episode; a shorter one continues with the next episode."""
 
@@ -85,7 +85,8 @@ def command(
     _check_seconds(seconds, viewer, record, env)
     if env is not None or episode is not None:
         check_choice(env, episode, num_envs, record_mode, held)
-    words, usual = overrides or [], max(_VIDEO_ENVS, drawn) if video is not None and env is None else None
+    words, prints = overrides or [], record is None and viewers[0][0] == "none"
+    usual = max(_USUAL_ENVS, drawn) if (video is not None or prints) and env is None else None
     request = PolicyRequest(
         task, words, checkpoint, policy, stochastic, num_envs, seed, config, runs_dir, None, (env or 0) + 1, usual
     )
@@ -167,7 +168,8 @@ def _statistics(session: Session, record: Path | None, record_mode: str) -> None
     from rlcli.cli.ui.evaluation_tables import show_summary
     from rlcli.evaluation.session import run_episodes, save_episodes
 
-    console.info("one episode per environment, as numbers (--video FILE.mp4 writes a video)")
+    count = session.env.num_envs
+    console.info(f"{count} episodes, one per environment, as numbers (--num-envs N; --video FILE.mp4 writes a video)")
     summary, recorder = run_episodes(session, session.env.num_envs, records=record is not None)
     show_summary(summary)
     recorded, unsaved = save_episodes(recorder, record, record_mode)

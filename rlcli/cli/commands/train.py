@@ -223,6 +223,10 @@ def _print(result: TrainingResult) -> None:
 
 def _next_steps(result: TrainingResult) -> list[str]:
     """Return messages that explain the last success rate or return, and name commands that judge the policy."""
+    from rlcli.runs.overview import newest_rows
+    from rlcli.runs.run import Run
+    from rlcli.training.progress import no_episode_note
+
     kind = "Eval" if "Eval/mean_reward" in result.metrics else "Train"  # Eval: the last iteration was evaluated
     success, mean_return = (result.metrics.get(f"{kind}/{name}") for name in ("success_rate", "mean_reward"))
     if mean_return is None:
@@ -232,7 +236,8 @@ def _next_steps(result: TrainingResult) -> list[str]:
     if kind == "Eval":
         lines = [f"{figure} in the last evaluation, without exploration noise; repeat: rlcli eval --checkpoint {run}"]
     else:
-        counts = "counts the last episodes of the training, with exploration noise"
+        old = no_episode_note(newest_rows(Run(result.run)) or [result.metrics])
+        counts = f"counts the last episodes of the training{old and f' ({old})'}, with exploration noise"
         lines = [f"{figure} {counts}; without noise: rlcli eval --checkpoint {run}"]
     if success is None or success < _GOOD:
         lines.append(f"compare it with a policy of zero actions: rlcli eval --compare {run} zero")

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Annotated, Any, get_args
 
 import typer
+from typer._click.globals import get_current_context
 from typer.models import OptionInfo
 
 from rlcli import progress
@@ -178,7 +179,7 @@ def add_command(app: typer.Typer, name: str, function: Callable[..., None], **se
         progress.view = WorkView
         given = {option: value for option, value in values.items() if option not in _COMMON}
         try:
-            with progress.track(f"rlcli {name}"):
+            with progress.track(get_current_context().command_path):
                 function(**given)
         except TYPER_ERRORS as error:
             if isinstance(error, OSError | EOFError) or raised_by_task(error):

@@ -143,6 +143,8 @@ def _share(nested: Sequence[Work]) -> float:
     share = 0.0
     for work in reversed(nested):
         share = max(work.fraction(), (work.done + share) / (work.total or 1))
+    if len(nested) > 1:
+        nested[0].share = share  # it does not fall while one part has ended and the next has not begun
     return share
 
 
@@ -186,6 +188,7 @@ class TrainingView(LiveView):
         tables = []
         for heading, prefix in (
             ("training", "Train/"),
+            ("evaluation", "Eval/"),
             ("reward terms", "Episode_Reward/"),
             ("terminations", "Episode_Termination/"),
             ("learner", ("Loss/", "Policy/")),
@@ -195,10 +198,10 @@ class TrainingView(LiveView):
                 continue
             table = Table(heading, "", box=None, pad_edge=False, header_style="bold cyan")
             for name, value in rows[:_MAX_ROWS]:
-                is_share = prefix == "Episode_Termination/" or (name.endswith("_rate") and prefix == "Train/")
+                is_share = prefix == "Episode_Termination/" or name in ("Train/success_rate", "Eval/success_rate")
                 table.add_row(Text(plain(name.partition("/")[2])), f"{value:.1%}" if is_share else f"{value:.4g}")
             tables.append(table)
-        notes = Text("\n".join(map(plain, progress.notes)), style="yellow")
+        notes = Text("\n".join(map(plain, filter(None, [progress.no_episode, *progress.notes]))), style="yellow")
         return Group(head, Columns(tables, padding=(0, 4)), notes)
 
 
@@ -207,6 +210,8 @@ def _line(progress: Progress) -> str:
     for name, word, form in _LINE_METRICS:
         if name in progress.metrics:
             parts.append(f"{word} {progress.metrics[name]:{form}}")
+    if progress.no_episode:
+        parts.append(f"({progress.no_episode})")
     return "  ".join([*parts, _left(progress)])
 
 
@@ -215,7 +220,8 @@ def _iteration(progress: Progress) -> str:
 
 
 def _left(progress: Progress) -> str:
-    return f"{'?' if progress.remaining_s is None else duration_text(progress.remaining_s)} left"
+    most = "at most " if progress.may_end_earlier and progress.remaining_s is not None else ""
+    return f"{most}{'?' if progress.remaining_s is None else duration_text(progress.remaining_s)} left"
 
 
 def duration_text(seconds: float) -> str:

@@ -248,6 +248,12 @@ def test_play_without_display_prints_numbers(cli, trained):
     assert cli("play", "cartpole", "--json").json["video"] is None
 
 
+def test_printed_values_are_of_few_episodes_unless_more_are_named(cli):
+    words = ("play", "cartpole", "--policy", "zero", "--viewer", "none", "--json", "episode_length_s=1.0")
+    assert cli(*words).json["episodes"] == 16
+    assert cli(*words, "--num-envs", 20).json["episodes"] == 20
+
+
 def test_native_viewer_without_display_is_machine_error(cli, trained):
     done = cli("play", "cartpole", "--viewer", "native")
     assert done.code == 10
@@ -380,6 +386,23 @@ def test_run_with_missing_distribution_names_it(cli, trained):
     done = cli("eval", "--checkpoint", trained)
     assert done.code == 4
     assert "install robot-tasks 2.5" in done.err
+
+
+def test_run_of_a_package_is_played_with_the_folder_of_the_task(cli, coin):
+    cli("train", coin, *SMALL, "--max-iterations", 1)
+    (run,) = Path("runs").glob("coin/*")
+    record = json.loads((run / "run.json").read_text())
+    record["task"] |= {"name": "my-coin", "distribution": "robot-tasks", "version": "2.5", "folder": None}
+    (run / "run.json").write_text(json.dumps(record))
+    Path("coin").rename("my_coin")
+    done = cli("eval", "--checkpoint", run)
+    assert done.code == 4
+    assert "or name its folder: rlcli play FOLDER --checkpoint" in done.err
+    assert cli("eval", "./my_coin", "--checkpoint", run, "--episodes", 2).code == 0
+    Path("my_coin").rename("other")
+    done = cli("eval", "./other", "--checkpoint", run)
+    assert done.code == 2
+    assert "is a run of my-coin, not of other" in done.err
 
 
 @pytest.mark.parametrize("command", [("eval", "--checkpoint"), ("train", "--max-iterations", "3", "--resume")])

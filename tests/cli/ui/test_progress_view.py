@@ -34,6 +34,34 @@ def test_line_has_what_how_far_and_time_left():
     assert work_line([]) == ""
 
 
+def test_percentage_does_not_fall_between_two_parts():
+    policies, episodes = Work("policies", 2), Work("episodes", 24, share=0.94)
+    assert "policies 0/2, episodes 0/24, 47%" in work_line([policies, episodes])
+    assert "policies 0/2, 47%" in work_line([policies])
+    policies.advance()
+    assert "policies 1/2, 50%" in work_line([policies])
+    assert "policies 1/2, episodes 0/24, 50%" in work_line([policies, Work("episodes", 24)])
+
+
+def test_progress_names_the_subcommand(monkeypatch):
+    import typer
+    from typer.testing import CliRunner
+
+    from rlcli import progress
+    from rlcli.cli.ui.options import add_command
+
+    def body() -> None:
+        """Print the name of the running operation."""
+        typer.echo(progress._running[0].what)
+
+    monkeypatch.setattr(progress, "view", None)
+    app, group = typer.Typer(), typer.Typer()
+    add_command(group, "sb3", body)
+    add_command(group, "other", body)
+    app.add_typer(group, name="import")
+    assert CliRunner().invoke(app, ["import", "sb3"], prog_name="rlcli").output == "rlcli import sb3\n"
+
+
 def test_works_of_threads_run_beside_each_other():
     begin = time.monotonic() - 10.1  # 38.4 s left, which no delay of this test changes to 37
     tasks, trainers = (

@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from rlcli.cli.ui.console import console
-from rlcli.cli.ui.progress_view import TrainingView
+from rlcli.cli.ui.progress_view import TrainingView, _line
 from rlcli.cli.ui.tables import fill
 from rlcli.evaluation.stress_parameters import read_sweeps
 from rlcli.reporting.heat_map import heat_map
@@ -116,3 +116,49 @@ def test_remaining_time_is_that_of_recent_iterations():
     progress = progress_from_metrics(rows, 103)
     assert (progress.remaining_s, progress.steps_per_s) == (pytest.approx(40.0), pytest.approx(250.0))
     assert progress_from_metrics(rows[:1], 103).remaining_s == pytest.approx(102 * 30.0)
+
+
+def _rows(ended):
+    """Return rows of a training; in each, `ended` says whether episodes have ended in the iteration."""
+    rows = []
+    for number, has_ended in enumerate(ended, 1):
+        row = {"iteration": number, "step": 100 * number, "Perf/collection_time": 0.1}
+        if any(ended[:number]):
+            row |= {"Train/mean_reward": -2.151, "Train/mean_episode_length": 109.0, "Train/success_rate": 0.0}
+        rows.append(row | ({"Episode_Termination/tilted": 1.0} if has_ended else {}))
+    return rows
+
+
+@pytest.mark.parametrize(
+    ("ended", "note"),
+    [
+        ([False, False], "no episode has ended yet"),
+        ([False, True], ""),
+        ([True, False], "no episode ended for 1 iteration, so the figures are older"),
+        ([True] + [False] * 15, "no episode ended for 15 iterations, so the figures are older"),
+        ([True, False, False, True], ""),
+    ],
+)
+def test_line_of_a_training_says_how_old_its_figures_are(ended, note):
+    from rich.console import Console
+    from rich.live import Live
+
+    progress = progress_from_metrics(_rows(ended), 40)
+    assert progress.no_episode == note
+    assert ("(no episode" in _line(progress)) is bool(note)
+    view, screen = TrainingView("rlcli train go1"), Console(file=io.StringIO(), width=120)
+    view._live = Live(console=screen)
+    screen.print(view._table(progress))
+    assert note in screen.file.getvalue()
+
+
+def test_age_of_figures_beyond_the_known_rows_is_a_lower_bound():
+    progress = progress_from_metrics(_rows([True, False, False, False])[2:], 40)
+    assert progress.no_episode == "no episode ended for at least 2 iterations, so the figures are older"
+
+
+def test_time_left_of_a_training_with_a_threshold_is_an_upper_bound():
+    progress = progress_from_metrics(_rows([True, True]), 40)
+    assert not _line(progress).endswith("at most 0:03 left")
+    progress.may_end_earlier = True
+    assert _line(progress).endswith("at most 0:03 left")
