@@ -10,6 +10,7 @@ from typing import Any
 from rlcli.errors import ConfigError, TaskError, did_you_mean, listing
 from rlcli_isaaclab.absent import AbsentValue, reason_of
 from rlcli_isaaclab.actuator_reader import JointSettings, add_joint_settings, read_actuators, settings_of
+from rlcli_isaaclab.body_properties import read_body_properties
 from rlcli_isaaclab.collection import entity_name
 from rlcli_isaaclab.light_reader import read_light
 from rlcli_isaaclab.model_lookup import given_models, is_end_of, mjcf_of, model_hint
@@ -312,7 +313,8 @@ class SceneReader:
         spawn.skip("func", "visible", "copy_from_source", "activate_contact_sensors", "semantic_tags")
         spawn.skip("visual_material_path", "variants")
         self._read_model(name, model)
-        entity: dict[str, Any] = {"model": model, "velocity_point": "com"}
+        properties = read_body_properties(spawn, self._models.get(name, {}).get("fixed"))
+        entity: dict[str, Any] = {"model": model, "velocity_point": "com", **properties}
         init = item.node("init_state")
         position = [as_float(v) for v in init.get("pos", (0.0, 0.0, 0.0))]
         rotation = [as_float(v) for v in init.get("rot", (1.0, 0.0, 0.0, 0.0))]
@@ -349,8 +351,10 @@ class SceneReader:
         rigid, mass = spawn.data.get("rigid_props") or {}, spawn.node("mass_props")
         if rigid.get("kinematic_enabled"):
             config["mocap"] = True
+            spawn.node("rigid_props").skip("kinematic_enabled")
         elif kind_of(item.data.get("class_type")) == "RigidObject" or rigid:
             config |= {"free": True, "velocity_point": "com"}
+        config |= read_body_properties(spawn)
         for key in ("mass", "density"):
             if mass.get(key):
                 config[key] = as_float(mass.get(key))

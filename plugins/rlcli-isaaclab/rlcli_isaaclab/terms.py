@@ -257,7 +257,8 @@ class _Bound:
     def __call__(self, selection: Selection | None = None) -> Any:
         if selection is not None:
             self._env.selection = selection
-            value = self.term(self._env, selection.env_ids(), **self.params)
+            log = self._env.managed.task_log
+            value = log.call_reset(lambda: self.term(self._env, selection.env_ids(), **self.params))
             # a curriculum term may return several values to log; rlcli logs one
             return next(iter(value.values()), None) if isinstance(value, dict) else value
         if self._reads_reset:  # reset events create attributes that decide the shape of the value
