@@ -9,8 +9,11 @@ from test_unchanged_isaaclab_files import DIRECT
 
 from rlcli.config.load import resolve
 from rlcli.envs.make import make_env
+from rlcli.errors import TaskError
 from rlcli.evaluation.evaluate import evaluate
 from rlcli.registry import find_task
+from rlcli.registry.task_location import task_reference
+from rlcli.testing.checks import check_task
 from rlcli_isaaclab.absent import report_once
 
 torch.set_num_threads(1)
@@ -150,3 +153,75 @@ def test_settings_of_a_direct_task_without_an_effect_are_reported(pole):
     resolved = pole(('usd_path="omniverse://somewhere/pole.usd"', scale), seed)
     ignored = {note.key for note in resolved.notes if note.status == "ignored"}
     assert {"scene.robot.spawn.scale", "seed", "is_finite_horizon"} <= ignored
+
+
+CURRICULUM = """
+def widen(env, env_ids, name):
+    ranges = env.command_manager.get_term(name).cfg.ranges
+    return torch.tensor(ranges.lin_vel_x[1])
+"""
+COMMAND = """mdp.UniformVelocityCommandCfg(
+        asset_name="robot", resampling_time_range=(4.0, 6.0), heading_command=False,
+        ranges=mdp.UniformVelocityCommandCfg.Ranges(lin_vel_x=(-0.3, 0.5), lin_vel_y=(0.0, 0.0), ang_vel_z=(-1.0, 1.0)))
+"""
+
+
+def test_command_of_isaac_labs_class_has_the_names_and_ranges_of_the_built_in_one(tmp_path):
+    terms = {"commands": {"base_velocity": COMMAND}}
+    terms["curriculum"] = {"wide": "CurriculumTermCfg(func=widen, params={'name': 'base_velocity'})"}
+    env = make_env(rover(tmp_path / "rover", CURRICULUM, **terms), seed=0)
+    env.reset()
+    knobs = env.command_manager.knobs()
+    assert [(knob.name, knob.low, knob.high) for knob in knobs] == [
+        ("vx", -0.3, 0.5), ("vy", -1.0, 1.0), ("wz", -1.0, 1.0),
+    ]  # fmt: skip
+    env.command_manager.hold("vx", 0.25)
+    env.step(torch.zeros(env.num_envs, env.layout.action_size))
+    assert env.command_manager.get_command("base_velocity")[:, 0].tolist() == [0.25] * env.num_envs
+
+
+def test_markers_of_a_task_are_reported_once(pole, caplog):
+    own = "        self.applied = 0\n"
+    markers = (
+        "        from isaaclab.markers import VisualizationMarkers, VisualizationMarkersCfg\n"
+        "        for name in ('a', 'b'):\n"
+        "            goal = VisualizationMarkers(VisualizationMarkersCfg(prim_path=name, markers={}))\n"
+    )
+    with caplog.at_level(logging.WARNING):
+        make_env(pole((own, own + markers)), seed=0)
+    assert [r.getMessage() for r in caplog.records if "VisualizationMarkers are not drawn" in r.getMessage()] != []
+    assert len(caplog.records) == 1
+
+
+RANDOM = RESET + "        self.observed[env_ids] = torch.rand(len(env_ids), device=self.device)\n"
+
+
+def test_check_accepts_draws_of_torch_and_the_usual_time_out(pole, tmp_path):
+    changes = (
+        (RESET, RANDOM),
+        ("        self.observed += 1\n", ""),
+        ("episode_length_s = 0.2", "episode_length_s = 1.0"),
+    )
+    pole(*changes)
+    report = check_task(f"{tmp_path}/pole/pole_env.py:PoleEnvCfg", only=["same-seed", "truncation"])
+    found = {finding.check: finding.severity for finding in report}
+    assert found == {"same-seed": "warning", "truncation": "warning"}
+
+
+def test_recorded_task_of_a_package_is_named_with_its_id(package):
+    folder = package()
+    source = find_task(f"{folder}:Template-Cartpole-v0")
+    assert task_reference(source.record()) == f"{folder}:Template-Cartpole-v0"
+    assert task_reference(find_task("cartpole").record()) == "cartpole"
+
+
+def test_package_without_an_id_lists_the_registered_ids(package, tmp_path):
+    above = tmp_path / "above"
+    above.mkdir()
+    (above / "__init__.py").write_text("")
+    package("above/tasks")
+    with pytest.raises(TaskError) as raised:
+        find_task(str(above))
+    assert raised.value.hint == (
+        f"the package registers tasks; write {above}:ID with one of these IDs: Template-Cartpole-v0"
+    )
