@@ -109,6 +109,9 @@ class SceneReader:
         for name in self._asked.keys() - self.entities.keys() if not self.report.problems else ():
             if any(is_end_of(name, path) for path in self._paths.values()):
                 continue
+            if isinstance(self._asked[name], Mapping) and self._asked[name].get("optional"):  # of a mapping file
+                self.report.entries[(f"--model {name}",)] = ("ignored", "the scene has no robot or object of this name")
+                continue
             near = did_you_mean(name, self.entities) or f"robots and objects: {listing(self.entities)}"
             self.report.problem(node.key, f"--model {name}: the scene has no '{name}'", near)
         if self.sensors:

@@ -1,5 +1,7 @@
 """Settings and values of Isaac Lab's tasks that must have an effect or a message: logged extras, gravity, markers."""
 
+import dataclasses
+import json
 import logging
 
 import pytest
@@ -7,7 +9,9 @@ import torch
 from test_isaaclab_user_code import rover
 from test_unchanged_isaaclab_files import DIRECT
 
+from rlcli.config.dump import to_data, to_yaml
 from rlcli.config.load import resolve
+from rlcli.config.model_option import read_models
 from rlcli.envs.make import make_env
 from rlcli.errors import TaskError
 from rlcli.evaluation.evaluate import evaluate
@@ -225,3 +229,23 @@ def test_package_without_an_id_lists_the_registered_ids(package, tmp_path):
     assert raised.value.hint == (
         f"the package registers tasks; write {above}:ID with one of these IDs: Template-Cartpole-v0"
     )
+
+
+def test_recorded_configuration_of_a_direct_task_has_its_own_settings(pole, tmp_path):
+    source = pole().source
+    resolved = resolve(source, overrides=["params.force=0.5"])
+    (tmp_path / "config.yaml").write_text(to_yaml(to_data(resolved)))
+    recorded = dataclasses.replace(source, config=tmp_path / "config.yaml")  # as a run does
+    assert resolve(recorded).task.params["force"] == 0.5
+
+
+def test_mapping_file_may_have_names_that_the_scene_lacks(tmp_path):
+    rover(tmp_path / "rover")
+    (tmp_path / "rover" / "models.yaml").rename(tmp_path / "rover" / "given.yaml")
+    (tmp_path / "rover" / "given.yaml").write_text("rover.usd: rover.xml\nother.usd: rover.xml\n")
+    source = find_task(f"{tmp_path / 'rover' / 'rover_env.py'}:RoverEnvCfg")
+    models = read_models([str(tmp_path / "rover" / "given.yaml")])
+    resolved = resolve(source, overrides=[f'models."{name}"={json.dumps(value)}' for name, value in models.items()])
+    assert resolved.task.scene.entities["robot"].model == f"file:{tmp_path / 'rover' / 'rover.xml'}"
+    (note,) = [note for note in resolved.notes if note.key.startswith("--model")]
+    assert (note.key, note.text) == ("--model other.usd", "the scene has no robot or object of this name")
