@@ -75,8 +75,8 @@ def to_data(resolved: Resolved) -> dict[str, Any]:
     if resolved.agent is not None:
         agent = resolved.agent.model_dump(mode="json", exclude={"task"})
         data["agents"] = {"default": resolved.agent_name, resolved.agent_name: agent}
-    if resolved.source.task is None:
-        data.pop("params", None)
+    if resolved.source.task is None and not data["params"]:
+        del data["params"]  # only direct tasks have parameters
     return data
 
 

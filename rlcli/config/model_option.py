@@ -15,6 +15,8 @@ from rlcli.registry.models import model_file
 
 MODELS = "models"
 """First key of the overrides that `--model` becomes."""
+OPTIONAL = "optional"
+"""Key of a model from a file of `--model`: the file may have names that the task's scene lacks."""
 
 
 def read_models(words: Iterable[str]) -> dict[str, Any]:
@@ -44,7 +46,8 @@ def read_models(words: Iterable[str]) -> dict[str, Any]:
                 hint = "write --model NAME=FILE.xml, or --model FILE.yaml with a mapping {NAME: FILE.xml}"
                 raise UsageError(f"--model {word}: there is no file '{settings.get('model')}'", hint=hint)
             path = str(file.resolve())
-            found[key] = {**settings, "model": path} if "gains" in settings else path
+            given = {**settings, "model": path} if "gains" in settings else path
+            found[key] = given if equals else {**settings, "model": path, OPTIONAL: True}
     return found
 
 

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 from rlcli.config import messages, python_task
 from rlcli.config.code_place import code_origin
 from rlcli.config.layers import Layers, Origin, document_origins, override_place, parse_override, read, without
-from rlcli.config.model_option import MODELS, given_settings, model_path
+from rlcli.config.model_option import MODELS, OPTIONAL, given_settings, model_path
 from rlcli.config.older_success import upgraded
 from rlcli.config.other_framework_keys import foreign_keys, merge_translation, move_foreign_keys
 from rlcli.config.possible_success import impossible_conditions
@@ -249,13 +249,12 @@ class TaskCheck:
                 form = self.format or formats.format_of_key(foreign_keys(self.layers.data))
                 if not (path := model_path(path, form, self.problems)):
                     continue
-            if value is None and path[0] in SECTIONS and not isinstance(self.layers.get(path), dict):
-                # null removes a term; for a term that does not exist, suggest one with a similar name
-                similar = did_you_mean(str(path[-1]), _mapping(self.layers.get(path[:-1])))
-                if similar:
-                    key = messages.dotted(path)
-                    self.add(Problem(origin.where, key, "there is no such term to remove", similar))
-                    continue
+                value = value["model"] if isinstance(value, dict) and value.pop(OPTIONAL, False) else value
+            # null removes a term; for a term that does not exist, suggest one with a similar name
+            removes = value is None and path[0] in SECTIONS and not isinstance(self.layers.get(path), dict)
+            if removes and (similar := did_you_mean(str(path[-1]), _mapping(self.layers.get(path[:-1])))):
+                self.add(Problem(origin.where, messages.dotted(path), "there is no such term to remove", similar))
+                continue
             try:
                 self.layers.set(path, value, origin)
             except LookupError as error:

@@ -135,6 +135,9 @@ class Environment(Protocol):
         terms are in `Episodes.metrics`.
         """
 
+    def reset_metrics(self) -> dict[str, Tensor]:
+        """Return the values that a task logged about the episodes that ended in this step, by name. (num_envs,) each"""
+
     def state_dict(self) -> dict[str, Tensor]:
         """Return copies of everything that the next steps depend on; call it between two steps."""
 

@@ -10,7 +10,7 @@ import itertools
 import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -44,6 +44,22 @@ _UNIT = re.compile(r"\[([^\]]+)\]")
 """Pattern of the unit in the first line of a term's docstring."""
 
 
+class TaskLog(Protocol):
+    """Interface of the values that the code of a task logs, by the name of the metric."""
+
+    def end_step(self) -> None:
+        """Add the present values to the means of the iteration; called once per step, after resets."""
+
+    def iteration_means(self) -> dict[str, Tensor]:
+        """Return the means over the steps since the last call. () each"""
+
+    def step_values(self, num_envs: int) -> dict[str, Tensor]:
+        """Return the values of this step. (num_envs,) each"""
+
+    def reset_values(self, num_envs: int) -> dict[str, Tensor]:
+        """Return the values that the last reset logged about the episodes that ended. (num_envs,) each"""
+
+
 class ManagedEnv(VecEnv):
     """Environment of a manager-based task.
 
@@ -61,6 +77,8 @@ class ManagedEnv(VecEnv):
             if prepare is not None:
                 prepare(scene.spec, config.params)
 
+    task_log: TaskLog | None = None
+    """Values that the code of a task of another framework logs; the plugin of the framework sets it."""
     command_manager: CommandManager
     action_manager: ActionManager
     event_manager: EventManager
@@ -220,6 +238,8 @@ class ManagedEnv(VecEnv):
         self.observation_manager.reset(selection)
 
     def _update_commands_and_events(self) -> None:
+        if self.task_log is not None:
+            self.task_log.end_step()
         self.curriculum_manager.advance(self._counters.common_step)
         if not self.event_manager.has_intervals and not self.command_manager.terms:
             return
@@ -248,8 +268,17 @@ class ManagedEnv(VecEnv):
         return self.observation_manager.recompute_last()
 
     def metric_values(self) -> dict[str, Tensor]:
-        """Return the last values of the curriculum terms, by name."""
-        return self.curriculum_manager.values()
+        """Return the last values of the curriculum terms, and the values that the task's code logs, by name."""
+        logged = {} if self.task_log is None else self.task_log.iteration_means()
+        return self.curriculum_manager.values() | logged
+
+    def step_metrics(self) -> dict[str, Tensor]:
+        """Return the values that the task's code logged in this step, by name. (num_envs,) each"""
+        return {} if self.task_log is None else self.task_log.step_values(self.num_envs)
+
+    def reset_metrics(self) -> dict[str, Tensor]:
+        """Return the values that a task logged about the episodes that ended in this step, by name. (num_envs,) each"""
+        return {} if self.task_log is None else self.task_log.reset_values(self.num_envs)
 
     def _workflow_state(self) -> dict[str, Tensor]:
         states = {name: part.state_dict() for name, part in self._parts().items()}

@@ -129,6 +129,10 @@ class Workflow(Environment):
         """
         return {}
 
+    def reset_metrics(self) -> dict[str, Tensor]:
+        """Return the values that a task logged about the episodes that ended in this step, by name. (num_envs,) each"""
+        return {}
+
     def unsaved_state(self) -> list[str]:
         """Return the names of attributes that `state_dict` cannot save; if there are none, a resumed run is exact."""
         return []

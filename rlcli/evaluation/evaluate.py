@@ -4,7 +4,7 @@ Each environment runs a fixed number of episodes, so that short episodes are not
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
@@ -146,7 +146,9 @@ def evaluate(
             obs = step.obs["policy"]
             on_step(step)
             if step.episodes is not None:
-                _add_episodes(result, step.episodes.ended(), quota, means)
+                ended = step.episodes.ended()
+                logged = {name: values.cpu()[ended.ids.cpu()].tolist() for name, values in env.reset_metrics().items()}
+                _add_episodes(result, ended, quota, means.finish(ended.ids) | logged)
             steps += 1
             work.what = f"step {steps:,} of at most {longest:,}, episodes"
             work.update(len(result.returns), steps / longest)  # several episodes may end in the same step
@@ -193,16 +195,16 @@ class _EpisodeMeans(StepObserver):
         return found
 
 
-def _add_episodes(result: Evaluation, ended: Episodes, quota: Tensor, means: _EpisodeMeans) -> None:
+def _add_episodes(result: Evaluation, ended: Episodes, quota: Tensor, logged: Mapping[str, list[float]]) -> None:
     """Add the episodes that have just ended to a result; skip environments that have run enough episodes.
 
     Args:
         result: the evaluation.
         ended: the episodes.
         quota: number of episodes that each environment must still run; reduced here. (num_envs,)
-        means: observer with the means of the task's metrics.
+        logged: metric of the task -> its value for each of the episodes.
     """
-    values = {name: column.tolist() for name, column in ended.metrics.items()} | means.finish(ended.ids)
+    values = {name: column.tolist() for name, column in ended.metrics.items()} | dict(logged)
     for row, env in enumerate(ended.ids.tolist()):
         if quota[env] <= 0:
             continue

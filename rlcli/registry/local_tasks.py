@@ -4,6 +4,7 @@
 """
 
 import ast
+import itertools
 import os
 import re
 from pathlib import Path
@@ -52,10 +53,10 @@ def folder_task(folder: Path, file: str = "task.yaml") -> TaskSource:
         inside = sorted(root.iterdir()) if root.is_dir() else []
         tasks = [repr(str(folder / path.name)) for path in inside if (path / file).is_file()]
         found = listing(path.name for path in inside) if root.is_dir() else "no such folder"
-        raise TaskError(
-            f"'{folder}' is not a task, because it has no {file}; found: {found}",
-            hint=f"did you mean {' or '.join(tasks[:3])}?" if tasks else None,
-        )
+        hint = f"did you mean {' or '.join(tasks[:3])}?" if tasks else None
+        if (root / "__init__.py").is_file() and (ids := _registered_ids(root)):
+            hint = f"the package registers tasks; write {folder}:ID with one of these IDs: {listing(ids)}"
+        raise TaskError(f"'{folder}' is not a task, because it has no {file}; found: {found}", hint=hint)
     terms, task = root / "terms.py", root / "task.py"
     return TaskSource(
         name=root.name,
@@ -66,6 +67,18 @@ def folder_task(folder: Path, file: str = "task.yaml") -> TaskSource:
         task=f"{task}:Task" if task.is_file() else None,
         task_file=task if task.is_file() else None,
     )
+
+
+def _registered_ids(root: Path) -> list[str]:
+    """Return the IDs that the files of a package register with Gymnasium, found in their text without an import."""
+    files = itertools.islice(sorted(root.rglob("*.py")), _MOST_FILES)
+    texts = (file.read_bytes() for file in files if file.is_file() and not file.is_symlink())
+    found = (match.decode(errors="replace") for text in texts for match in _REGISTERED.findall(text))
+    return list(dict.fromkeys(found))
+
+
+_MOST_FILES = 2000
+_REGISTERED = re.compile(rb"""register\(\s*(?:id\s*=\s*)?["']([\w./:-]{1,200})["']""")
 
 
 def python_config(root: Path) -> TaskSource | None:

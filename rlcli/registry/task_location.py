@@ -3,6 +3,7 @@
 The registry returns it for a task's name; the configuration and the environment are built from it.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -67,3 +68,11 @@ class TaskSource:
         folder = None if self.distribution else str(self.root)
         record = {"name": self.name, "distribution": self.distribution, "version": self.version, "folder": folder}
         return record | ({"python": self.python} if self.python and folder else {})
+
+
+def task_reference(record: Mapping[str, Any]) -> str:
+    """Return the text by which a command line names a recorded task (`TaskSource.record`), with the ID of a package."""
+    if record.get("distribution") or not (record.get("python") or record.get("folder")):
+        return str(record["name"])
+    file = record.get("file") or "task.yaml"
+    return str(record.get("python") or (record["folder"] if file == "task.yaml" else Path(record["folder"]) / file))

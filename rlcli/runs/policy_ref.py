@@ -11,6 +11,7 @@ from pathlib import Path
 from rlcli.errors import CheckpointError, UsageError
 from rlcli.registry import TaskSource
 from rlcli.registry.find import path_of
+from rlcli.registry.task_location import task_reference
 from rlcli.runs.checkpoint_reader import Checkpoint
 from rlcli.runs.policy_bundle import is_bundle, open_bundle
 from rlcli.runs.restore import recorded_task, source_of
@@ -107,6 +108,8 @@ def _shipped(named: TaskSource | None) -> Choice:
     if named is None:
         raise UsageError("--checkpoint shipped needs a task", hint="name the task: `rlcli play TASK`")
     if named.policy is None:
-        raise CheckpointError(f"{named.name} ships no policy", hint=f"rlcli train {named.name} trains one")
+        raise CheckpointError(
+            f"{named.name} ships no policy", hint=f"rlcli train {task_reference(named.record())} trains one"
+        )
     owner = f"{named.distribution} {named.version}" if named.distribution else str(named.root)
     return Choice(named.policy, f"the policy shipped with {owner}", None, open_bundle(named.policy))

@@ -115,6 +115,8 @@ class Scene:
         """
         self.config.entities[name] = entity
         name_all(child)
+        for body in [] if entity.gravity else child.bodies[1:]:
+            body.gravcomp = 1.0
         if child.compiler.settotalmass > 0:
             write_masses(child)
         models = [other for other, config in self.config.entities.items() if config.model is not None]

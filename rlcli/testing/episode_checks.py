@@ -48,6 +48,23 @@ def same_seed(subject: TaskUnderTest) -> Iterator[Finding]:
         message = "this output of the step differs between a new environment and the same one after reset(seed)"
         hint = "clear all state of the last episode in the term's reset(selection), or in reset_idx"
         findings = list(compare_trajectories(env, (first, third), message, hint))
+    yield from _without_torch_draws(subject, findings) if findings else ()
+
+
+def _without_torch_draws(subject: TaskUnderTest, findings: list[Finding]) -> Iterator[Finding]:
+    """Yield the findings of `same_seed`, as warnings if torch's generator explains them in another framework's task.
+
+    Code for other frameworks draws from torch's generator, which a training seeds.
+    """
+    if subject.resolved.format is not None:
+        env, other = subject.env(episode_steps=12), subject.env(episode_steps=12)
+        trajectories = []
+        for one in (env, other):
+            torch.manual_seed(0)
+            trajectories.append(record_outputs(one, random_actions(one, subject.bound, 30)))
+        if not list(compare_trajectories(env, trajectories, "", "")):
+            hint = "nothing to do for trainings: they seed torch's generator, so that the same --seed repeats them"
+            findings = [warning_at(each.where, f"{each.message} (from torch's generator)", hint) for each in findings]
     yield from findings
 
 
@@ -229,7 +246,9 @@ def back_fill(subject: TaskUnderTest) -> Iterator[Finding]:
             where, values = _difference(pair.kept, f"observation '{group}'", first, second, "at its start")
             message = f"the first observation of an episode depends on the actions of the episode before: {values}"
             hint = "fill histories, delays and buffers of the reset environments in reset(selection) or reset_idx"
-            yield error_at(where, message, hint)
+            # usual in another framework's direct tasks, which keep the last actions
+            make = error_at if subject.resolved.format is None else warning_at
+            yield make(where, message, hint)
 
 
 def truncation(subject: TaskUnderTest) -> Iterator[Finding]:
@@ -256,8 +275,12 @@ def truncation(subject: TaskUnderTest) -> Iterator[Finding]:
     if early[0] and early[0] == early[1] and len(early[0]) == 1:
         count = early[0].pop()
         steps = f"{count} step{'s' if count > 1 else ''}"
-        message = f"every episode is truncated {steps} before its limit; it must be truncated at its limit"
-        yield error_at("terminations", message, hint)
+        message = f"every episode is truncated {steps} before its limit"
+        if count == 1 and subject.resolved.format is not None:
+            hint = "usual in the task's framework; for the full length compare the step with `>= max_episode_length`"
+            yield warning_at("terminations", message, hint)
+        else:
+            yield error_at("terminations", f"{message}; it must be truncated at its limit", hint)
     elif any(early):
         message = "some episodes are truncated before their limit"
         yield warning_at("terminations", message, "use `time_out: true` only for ends that do not depend on the state")

@@ -43,6 +43,16 @@ class _RobotCommand(CommandTerm):
 class UniformVelocityCommand(_RobotCommand):
     """Command of a velocity in the robot's frame, sampled uniformly: x, y [m/s] and yaw rate [rad/s]."""
 
+    elements = ("vx", "vy", "wz")
+    units = ("m/s", "m/s", "rad/s")
+
+    @property
+    def limits(self) -> list[Any]:
+        """Present range of each column; empty if another distribution draws the commands."""
+        ranges = self.cfg.ranges
+        names = ("lin_vel_x", "lin_vel_y", "ang_vel_z")
+        return [getattr(ranges, name) for name in names] if all(hasattr(ranges, name) for name in names) else []
+
     def __init__(self, cfg: Any, env: Any) -> None:
         super().__init__(cfg, env)
         if cfg.heading_command and cfg.ranges.heading is None:
@@ -101,6 +111,9 @@ class NormalVelocityCommand(UniformVelocityCommand):
 class UniformPoseCommand(_RobotCommand):
     """Command of a pose of a body, in the frame of the robot's root."""
 
+    elements = ("x", "y", "z", "", "", "", "")
+    units = ("m", "m", "m")
+
     def __init__(self, cfg: Any, env: Any) -> None:
         super().__init__(cfg, env)
         self.body_idx = self.robot.find_bodies(cfg.body_name)[0][0]
@@ -132,6 +145,9 @@ class UniformPoseCommand(_RobotCommand):
 
 class UniformPose2dCommand(_RobotCommand):
     """Command of a position and a heading on the ground, in the robot's frame."""
+
+    elements = ("ahead", "left", "", "turn")
+    units = ("m", "m", "m", "rad")
 
     def __init__(self, cfg: Any, env: Any) -> None:
         super().__init__(cfg, env)

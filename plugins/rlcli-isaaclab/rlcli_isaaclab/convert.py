@@ -44,8 +44,8 @@ def task(
     config: dict[str, Any] = {
         "decimation": top.require("decimation"),
         "episode_length_s": as_float(top.require("episode_length_s")),
-        "sim": _sim(top.node("sim")),
-        "viewer": _viewer(top.node("viewer")),
+        "sim": read_sim(top.node("sim")),
+        "viewer": read_viewer(top.node("viewer")),
     }
     scene = SceneReader(top.node("scene"), root, models)
     config["scene"] = scene.read()
@@ -67,17 +67,23 @@ def task(
     for section in ("events", "curriculum", "commands"):
         if not config[section]:
             del config[section]
-    if top.data.get("is_finite_horizon"):
-        top.note("ignored", "is_finite_horizon", "rlcli always bootstraps at a time-out")
-    top.mark_mapped(
-        "ui_window_class_type", "wait_for_textures", "rerender_on_reset", "export_io_descriptors", "log_dir"
-    )
-    top.mark_mapped("num_rerenders_on_reset", "recorders", "teleop_devices", "xr", "is_finite_horizon")
-    if "seed" in top:
-        top.note("ignored", "seed", "set the seed on the command line: --seed N")
+    note_general_settings(top)
+    top.mark_mapped("export_io_descriptors", "recorders", "teleop_devices")
     report.stubs = terms.stubs
     report.finish(data, defaults)
     return {key: value for key, value in config.items() if value is not None}
+
+
+def note_general_settings(top: Node) -> None:
+    """Note the settings without an effect in rlcli that manager-based and direct tasks have in common."""
+    top.mark_mapped(
+        "ui_window_class_type", "wait_for_textures", "rerender_on_reset", "num_rerenders_on_reset", "log_dir"
+    )
+    top.mark_mapped("xr", "is_finite_horizon")
+    if top.data.get("is_finite_horizon"):
+        top.note("ignored", "is_finite_horizon", "rlcli always bootstraps at a time-out")
+    if "seed" in top:
+        top.note("ignored", "seed", "set the seed on the command line: --seed N")
 
 
 _OPTIONAL = ("events", "terminations", "curriculum", "commands")
@@ -234,7 +240,8 @@ def _network(policy: Node, name: str) -> dict[str, Any]:
     return {"hidden": list(policy.require(name) or []), "activation": policy.get("activation", "elu")}
 
 
-def _sim(node: Node) -> dict[str, Any]:
+def read_sim(node: Node) -> dict[str, Any]:
+    """Return the section `sim:` of the task."""
     config: dict[str, Any] = {"dt": as_float(node.get("dt", 1.0 / 60.0))}
     interval = node.get("render_interval", 1)
     if interval != 1:
@@ -262,7 +269,8 @@ def _sim(node: Node) -> dict[str, Any]:
     return config
 
 
-def _viewer(node: Node) -> dict[str, Any]:
+def read_viewer(node: Node) -> dict[str, Any]:
+    """Return the section `viewer:` of the task."""
     config = {
         "eye": [as_float(v) for v in node.get("eye", (7.5, 7.5, 7.5))],
         "lookat": [as_float(v) for v in node.get("lookat", (0.0, 0.0, 0.0))],

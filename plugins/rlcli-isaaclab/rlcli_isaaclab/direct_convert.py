@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import inspect
 import sys
 from collections.abc import Mapping
@@ -24,6 +25,11 @@ from rlcli_isaaclab.term_reader import TermReader
 from rlcli_isaaclab.user_actuators import actuator_events
 from rlcli_isaaclab.user_files import reads_body_forces
 
+_READ = (
+    *("decimation", "episode_length_s", "observation_noise_model", "action_noise_model"),
+    *("action_space", "observation_space", "state_space", "num_actions", "num_observations", "num_states"),
+)
+"""Settings that this module and the direct environment read."""
 _KINDS = {"set_joint_effort_target": "motor", "set_joint_velocity_target": "velocity"}
 
 
@@ -64,7 +70,8 @@ def direct_task(cfg: Any, env_class: type, root: Path, models: Mapping[str, Any]
         "decimation": cfg.decimation,
         "episode_length_s": float(cfg.episode_length_s),
         "reward_dt_scaling": False,
-        "sim": convert._sim(top.node("sim")),
+        "sim": convert.read_sim(top.node("sim")),
+        "viewer": convert.read_viewer(top.node("viewer")),
         "scene": scene.read(),
     }
     source = _source_of(env_class)
@@ -94,8 +101,10 @@ def direct_task(cfg: Any, env_class: type, root: Path, models: Mapping[str, Any]
     if cfg.state_space:
         states = hook("critic", shape_of(cfg.state_space, "state_space"))
         config["observations"]["critic"] = {"state": {"func": states}}
-    if report.problems:
-        raise ConfigError(report.problems)
+    convert.note_general_settings(top)
+    top.mark_mapped(*_READ)
+    known = {field.name: data[field.name] for field in dataclasses.fields(DirectRLEnvCfg)}
+    report.finish(known | {"scene": scene_data}, to_dict(DirectRLEnvCfg()))
     config["params"], params = own_fields(original, DirectRLEnvCfg)
     return PythonTask({key: v for key, v in config.items() if v is not None}, notes=report.user_notes(), params=params)
 

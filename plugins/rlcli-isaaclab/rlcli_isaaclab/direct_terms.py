@@ -17,12 +17,17 @@ from rlcli.errors import TaskError
 from rlcli.managers.attribute_state import AttributeState
 from rlcli.sim.env_selection import Selection
 from rlcli_isaaclab.direct_env import DirectRLEnv, building
+from rlcli_isaaclab.extras_log import ExtrasLog
 from rlcli_isaaclab.missing_names import place_of
 from rlcli_isaaclab.observation_noise import noise_model
+from rlcli_isaaclab.runtime import facade_of
 from rlcli_isaaclab.substeps import Substeps
 from rlcli_isaaclab.task_fields import set_own_fields
 from rlcli_isaaclab.user_files import adapt_to_device
 from rlcli_isaaclab.utils.buffers import call_without_effects
+
+_OWN_METRICS = ("Episode_Reward/reward", "Episode_Termination/terminated", "Episode_Termination/time_out")
+"""Metrics that rlcli computes for each direct task."""
 
 
 class HookTerm:
@@ -71,6 +76,8 @@ class DirectRunner:
             asset.start_wrenches(by_task=True)
         self.action_noise = noise_model(cfg.action_noise_model, managed)
         self.observation_noise = noise_model(cfg.observation_noise_model, managed)
+        facade_of(managed).extras = self.lab.extras  # events of the configuration get this object as `env`
+        managed.task_log = self.log = ExtrasLog(lambda: self.lab.extras, _OWN_METRICS)
         self._memory = AttributeState(self.lab, excluded=("cfg", "managed", "sim", "scene"))
         self._observed: dict[str, Tensor] = {}
 
@@ -108,7 +115,7 @@ class DirectRunner:
         """Call `_reset_idx`."""
         ids = selection.env_ids()
         if len(ids):
-            self.lab._reset_idx(ids)
+            self.log.call_reset(lambda: self.lab._reset_idx(ids))
             self.observation_noise.reset(ids)
             self.action_noise.reset(ids)
         self.phase = "reset"

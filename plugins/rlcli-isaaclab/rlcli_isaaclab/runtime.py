@@ -20,6 +20,7 @@ from rlcli.envs.make import make_env
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import did_you_mean, listing
 from rlcli.registry import is_framework, load_object
+from rlcli_isaaclab.extras_log import ExtrasLog
 from rlcli_isaaclab.manager_facade import (
     ActionManagerFacade,
     CommandManagerFacade,
@@ -56,7 +57,8 @@ class ManagerBasedRLEnv(gymnasium.Env):
     @classmethod
     def _of(cls, managed: VecEnv) -> ManagerBasedRLEnv:
         facade = cls.__new__(cls)
-        facade.managed, facade.cfg, facade.extras = managed, managed.config, {}
+        facade.managed, facade.cfg, facade.extras = managed, managed.config, {"log": {}}
+        facade.managed.task_log = ExtrasLog(lambda: facade.extras)
         facade._scene, facade._manager_facades = None, {}
         return facade
 
@@ -194,13 +196,12 @@ class ManagerBasedRLEnv(gymnasium.Env):
     def step(self, action: Tensor) -> Any:
         """Step all environments. Return observations by group, reward, terminated, truncated and `extras`."""
         result = self.managed.step(action.to(self.managed.device))
-        self.extras["log"] = {}
         if result.episodes is not None:
             ended = result.episodes.ended()
             length = self.max_episode_length_s
             terms = {f"Episode_Reward/{n}": v.mean() / length for n, v in ended.reward_terms.items() if len(v)}
             causes = {f"Episode_Termination/{n}": v.sum() for n, v in ended.causes.items()}
-            self.extras["log"] = {**terms, **causes}
+            self.extras["log"] = self.extras.get("log", {}) | terms | causes
         self.extras["time_outs"] = result.truncated
         return result.obs, result.reward, result.terminated, result.truncated, self.extras
 

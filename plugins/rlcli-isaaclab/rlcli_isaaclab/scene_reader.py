@@ -9,6 +9,7 @@ from typing import Any
 
 from rlcli.errors import ConfigError, TaskError, did_you_mean, listing
 from rlcli_isaaclab.actuator_reader import JointSettings, add_joint_settings, read_actuators, settings_of
+from rlcli_isaaclab.body_properties import read_body_properties
 from rlcli_isaaclab.collection import entity_name
 from rlcli_isaaclab.light_reader import read_light
 from rlcli_isaaclab.missing_names import AbsentValue, reason_of
@@ -107,6 +108,9 @@ class SceneReader:
         config["entities"] = self.entities
         for name in self._asked.keys() - self.entities.keys() if not self.report.problems else ():
             if any(is_end_of(name, path) for path in self._paths.values()):
+                continue
+            if isinstance(self._asked[name], Mapping) and self._asked[name].get("optional"):  # of a mapping file
+                self.report.entries[(f"--model {name}",)] = ("ignored", "the scene has no robot or object of this name")
                 continue
             near = did_you_mean(name, self.entities) or f"robots and objects: {listing(self.entities)}"
             self.report.problem(node.key, f"--model {name}: the scene has no '{name}'", near)
@@ -312,7 +316,8 @@ class SceneReader:
         spawn.mark_mapped("func", "visible", "copy_from_source", "activate_contact_sensors", "semantic_tags")
         spawn.mark_mapped("visual_material_path", "variants")
         self._read_model(name, model)
-        entity: dict[str, Any] = {"model": model, "velocity_point": "com"}
+        properties = read_body_properties(spawn, self._models.get(name, {}).get("fixed"))
+        entity: dict[str, Any] = {"model": model, "velocity_point": "com", **properties}
         init = item.node("init_state")
         position = [as_float(v) for v in init.get("pos", (0.0, 0.0, 0.0))]
         rotation = [as_float(v) for v in init.get("rot", (1.0, 0.0, 0.0, 0.0))]
@@ -349,8 +354,10 @@ class SceneReader:
         rigid, mass = spawn.data.get("rigid_props") or {}, spawn.node("mass_props")
         if rigid.get("kinematic_enabled"):
             config["mocap"] = True
+            spawn.node("rigid_props").mark_mapped("kinematic_enabled")
         elif kind_of(item.data.get("class_type")) == "RigidObject" or rigid:
             config |= {"free": True, "velocity_point": "com"}
+        config |= read_body_properties(spawn)
         for key in ("mass", "density"):
             if mass.get(key):
                 config[key] = as_float(mass.get(key))

@@ -257,7 +257,8 @@ class _Bound:
     def __call__(self, selection: Selection | None = None) -> Any:
         if selection is not None:
             self._env.selection = selection
-            value = self.term(self._env, selection.env_ids(), **self.params)
+            call = functools.partial(self.term, self._env, selection.env_ids(), **self.params)
+            value = self._env.managed.task_log.call_reset(call)
             # a curriculum term may return several values to log; rlcli logs one
             return next(iter(value.values()), None) if isinstance(value, dict) else value
         if self._reads_reset:  # reset events create attributes that decide the shape of the value
@@ -311,8 +312,12 @@ class _BoundCommand(_BoundObject):
 
     def __init__(self, term: Any) -> None:
         self.term = term
-        self.command = term.command.clone().float()
-        self._has_command = False
+        self.command, self._has_command = term.command.clone().float(), False
+        self.elements, self.units = getattr(term, "elements", None), getattr(term, "units", ())
+
+    @property
+    def limits(self) -> Any:
+        return getattr(self.term, "limits", ())
 
     def resample(self, selection: Selection) -> None:
         """Sample new commands in the selected environments."""

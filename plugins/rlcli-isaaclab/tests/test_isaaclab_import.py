@@ -107,7 +107,7 @@ def test_every_key_is_reported(imported):
     assert missing == []
     status = {row["key"]: row["status"] for row in document["keys"]}
     assert status["sim.dt"] == status["rewards.alive.weight"] == "mapped"
-    assert status["scene.robot.spawn.rigid_props"] == status["sim.physx"] == "ignored"
+    assert status["scene.robot.spawn.rigid_props.max_depenetration_velocity"] == status["sim.physx"] == "ignored"
     assert status["scene.robot.spawn.collision_props"] == "default"
 
 

@@ -119,6 +119,7 @@ def _create_run(
     form: str, file: Path, policy: ImportedPolicy, resolved: Resolved, runs_dir: Path | None, name: str | None
 ) -> None:
     """Write an imported policy as a new run, and print what was imported."""
+    from rlcli.registry.task_location import task_reference
     from rlcli.runs.run_ref import default_runs_dir
     from rlcli.training.import_policy import create_imported_run
 
@@ -131,7 +132,8 @@ def _create_run(
         f"{form} {policy.algorithm}: {spec['observation_size']} observations, hidden layers {hidden}"
         f" ({spec['activation']}), {spec['action_size']} actions {bound}"
     )
-    console.info(f"next: `rlcli play --checkpoint {run}` or `rlcli train {resolved.source.name} --init-from {run}`")
+    task = task_reference(resolved.source.record())
+    console.info(f"next: `rlcli play --checkpoint {run}` or `rlcli train {task} --init-from {run}`")
     console.data(str(run))
     console.document("import", form=form, run=str(run), algorithm=policy.algorithm, policy=spec)
 

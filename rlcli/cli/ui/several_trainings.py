@@ -12,6 +12,7 @@ from rlcli.cli.ui.console import console
 from rlcli.cli.ui.progress_view import LiveView
 from rlcli.cli.ui.tables import cell, fill
 from rlcli.errors import Stopped
+from rlcli.registry.task_location import task_reference
 from rlcli.reporting.curves import FEWEST_FOR_IQM
 from rlcli.runs.overview import Overview, overview
 from rlcli.tuning.compare_best_with_default import ARMS, Comparison, Training
@@ -107,9 +108,7 @@ def print_sweep(sweep: Sweep) -> None:
     if best is not None:
         run = documents[best.number]["run"] or "on the machine that trained it"
         console.info(f"best: trial {best.number}; its run: {run}")
-        source = settings["source"]  # a task that belongs to no package is named by its folder
-        task = settings["task"] if source.get("distribution") else source.get("folder", settings["task"])
-        console.info(f"to train with its settings: rlcli train {task} --config {file}")
+        console.info(f"to train with its settings: rlcli train {task_reference(settings['source'])} --config {file}")
     if (same := sweep.same_objective()) is not None:
         console.warn(
             f"all trials have the same objective, {settings['objective']} = {same:.6g}: the budget may be too short,"

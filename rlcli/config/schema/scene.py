@@ -190,6 +190,8 @@ class EntityConfig(StrictModel):
     velocity_point: Literal["origin", "com"] = "origin"
     """Point of a body whose linear velocity and acceleration are read by terms, given in `init` and set by events: the
     origin of the body's frame, or its centre of mass (com), as in Isaac Lab."""
+    gravity: bool = True
+    """false: gravity does not act on the bodies, as with MuJoCo's `gravcomp="1"`."""
     joints: dict[str, JointConfig] = {}
     """Joint name or regex -> changes of the joint. If several match a joint, the later one wins key by key."""
     actuators: dict[str, ActuatorConfig] = {}

@@ -174,8 +174,11 @@ class ShardedEnv(Environment):
 
     def step_metrics(self) -> dict[str, Tensor]:
         """Return the values that a direct task wrote to `extras` in this step, by name. (num_envs,) each"""
-        parts = self.call_all(_step_metrics)
-        return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+        return _joined_rows(self.call_all(_step_metrics))
+
+    def reset_metrics(self) -> dict[str, Tensor]:
+        """Return the values that a task logged about the episodes that ended in this step, by name. (num_envs,) each"""
+        return _joined_rows(self.call_all(_reset_metrics))
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return copies of everything that the next steps depend on, the same tensors as in a single process."""
@@ -361,7 +364,7 @@ class ShardedEnv(Environment):
 
     def _metric_values(self) -> dict[str, Tensor]:
         parts = self.call_all(_metric_values)
-        return {name: self._joined_metric([part[name] for part in parts]) for name in parts[0]}
+        return {name: self._joined_metric([part[name] for part in parts]) for name in _common_names(parts)}
 
     def _joined_metric(self, parts: Sequence[Tensor]) -> Tensor:
         """Return the values of a metric for all environments, joined from the shards.
@@ -420,6 +423,19 @@ def _metric_values(env: VecEnv) -> dict[str, Tensor]:
 
 def _step_metrics(env: VecEnv) -> dict[str, Tensor]:
     return env.step_metrics()
+
+
+def _reset_metrics(env: VecEnv) -> dict[str, Tensor]:
+    return env.reset_metrics()
+
+
+def _joined_rows(parts: Sequence[dict[str, Tensor]]) -> dict[str, Tensor]:
+    return {name: torch.cat([part[name] for part in parts]) for name in _common_names(parts)}
+
+
+def _common_names(parts: Sequence[dict[str, Tensor]]) -> list[str]:
+    """Return the names that all shards have: a task may log a value only after the first episode has ended."""
+    return [name for name in parts[0] if all(name in part for part in parts)]
 
 
 def _state(env: VecEnv) -> dict[str, Tensor]:
