@@ -53,10 +53,10 @@ def folder_task(folder: Path, file: str = "task.yaml") -> TaskSource:
         inside = sorted(root.iterdir()) if root.is_dir() else []
         tasks = [repr(str(folder / path.name)) for path in inside if (path / file).is_file()]
         found = listing(path.name for path in inside) if root.is_dir() else "no such folder"
-        hint = f"did you mean {' or '.join(tasks[:3])}?" if tasks else None
+        remedy = f"did you mean {' or '.join(tasks[:3])}?" if tasks else None
         if (root / "__init__.py").is_file() and (ids := _registered_ids(root)):
-            hint = f"the package registers tasks; write {folder}:ID with one of these IDs: {listing(ids)}"
-        raise TaskError(f"'{folder}' is not a task, because it has no {file}; found: {found}", hint=hint)
+            remedy = f"the package registers tasks; write {folder}:ID with one of these IDs: {listing(ids)}"
+        raise TaskError(f"'{folder}' is not a task, because it has no {file}; found: {found}", hint=remedy)
     terms, task = root / "terms.py", root / "task.py"
     return TaskSource(
         name=root.name,
