@@ -63,10 +63,11 @@ def recorded_task(
             try:
                 return installed_task(find_entry(TASKS, f"{owner}:{record['name']}", what="task"))
             except TaskError:
-                if named is None:
+                if named is None or named.distribution is not None:
                     raise
                 return named
-        if named is not None and (named.distribution is None or not Path(str(record.get("folder"))).is_dir()):
+        is_gone = not record.get("python") and not Path(str(record["folder"])).exists()
+        if named is not None and (named.distribution is None or is_gone):
             return named
         if not trusted_tasks.is_known(record):
             raise _untrusted_code_error(record, what, run)

@@ -228,8 +228,8 @@ class TrainLoop:
         trainer = self.trainer
         self._recent.append({**metrics, "iteration": trainer.iteration, "step": trainer.env_steps})
         progress = progress_from_metrics([*self._recent], budget.iterations(trainer))
-        evaluations = (row for row in reversed(self._recent) if "Eval/mean_reward" in row)
-        last_evaluation: dict[str, float] = next(evaluations, {})
+        evaluated = (row for row in reversed(self._recent) if "Eval/mean_reward" in row)
+        last_evaluation: dict[str, Any] = next(evaluated, {})
         progress.metrics |= {name: value for name, value in last_evaluation.items() if name.startswith("Eval/")}
         progress.may_end_earlier = self.periodic_eval is not None and self.periodic_eval.until is not None
         progress.notes = [] if self.health is None else [*self.health.notes(metrics), *self.run.findings()]
