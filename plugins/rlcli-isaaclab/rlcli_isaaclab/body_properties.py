@@ -16,7 +16,7 @@ def read_body_properties(spawn: Node, is_fixed: bool | None = None) -> dict[str,
     """
     rigid, articulation = spawn.node("rigid_props"), spawn.node("articulation_props")
     config = {"gravity": False} if rigid.get("disable_gravity") else {}
-    rigid.mark_mapped(*(name for name in ("linear_damping", "angular_damping") if not rigid.data.get(name)))
+    rigid.mark_mapped(*(name for name in _OFF_BY_DEFAULT if not rigid.data.get(name)))
     for node, name, without_effect in (
         (rigid, "rigid_body_enabled", True),
         (rigid, "enable_gyroscopic_forces", True),
@@ -32,6 +32,7 @@ def read_body_properties(spawn: Node, is_fixed: bool | None = None) -> dict[str,
     return config
 
 
+_OFF_BY_DEFAULT = ("linear_damping", "angular_damping", "retain_accelerations")
 _SOLVER = "MuJoCo's solver has its own settings: sim.iterations, the <option> of the MJCF"
 _DAMPING = "set the damping of joints, or the density and viscosity of <option>, in the MJCF"
 _REASONS = {
