@@ -22,6 +22,6 @@ def html(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def built(html):
-    """Every built page, by its path: `quickstart`, `zoo/cartpole`, `reference/terms`."""
+    """Every built page, by its path: `tutorials/quickstart`, `reference/zoo/cartpole`."""
     files = [file for file in html.rglob("*.html") if file.name not in ("genindex.html", "search.html")]
     return {file.relative_to(html).with_suffix("").as_posix(): Page(file) for file in files}

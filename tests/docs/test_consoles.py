@@ -21,6 +21,7 @@ TABLE = "         MEAN    95 % INTERVAL\nsuccess  0.9950  0.9900 .. 0.9980\nleng
         (TABLE, TABLE.replace("0.9950", "0.9860").replace("300", "297"), 0.02),
         ("1,966,080 steps\n", "1,966,081 steps\n", 1e-3),
         ("term -0.0449\n", "term -0.0352\n", 0.01),
+        ("a\nb\n", "rlcli play: 0:10 so far\na\nrlcli play: episodes 0/16, 30%, 0:29 left\nb\n", 0.0),
     ],
 )
 def test_what_is_the_same_passes(shown, printed, within):
@@ -42,6 +43,7 @@ def test_what_is_the_same_passes(shown, printed, within):
         ("one\n...\nfour\n", "one\ntwo\nthree\n", 0.0),
         ("a.b\n", "axb\n", 0.0),
         ("seed ... 42\n", "seed 1, agent 421\n", 0.0),
+        ("a\n", "rlcli play: no run\na\n", 0.0),
     ],
 )
 def test_what_differs_is_told(shown, printed, within):

@@ -1,13 +1,15 @@
 """Transcripts of a shell in a page: commands after `$`, and below them the expected output.
 
 `...` alone on a line stands for any lines, within a line for any text. Runs of spaces count as one. Numbers are equal,
-or as near as the page allows: `within` is relative to the larger of 1 and the number that is shown.
+or as near as the page allows: `within` is relative to the larger of 1 and the number that is shown. Lines of progress,
+which a command prints every ten seconds on a slow machine, are ignored.
 """
 
 import re
 from dataclasses import dataclass
 
 _NUMBER = re.compile(r"(?<![\w.])-?\d[\d,]*(?:\.\d+)?(?:e[+-]?\d+)?")
+_PROGRESS = re.compile(r"rlcli [a-z-]+: .*(so far|left)")
 
 
 @dataclass(frozen=True)
@@ -28,7 +30,7 @@ def commands(transcript):
 def difference(shown, printed, within=0.0):
     """Return None if `printed` equals the output in the page, otherwise the difference."""
     wanted = [_plain(line) for line in shown.splitlines() if line.strip()]
-    given = [_plain(line) for line in printed.splitlines() if line.strip()]
+    given = [_plain(line) for line in printed.splitlines() if line.strip() and not _PROGRESS.fullmatch(line)]
     reached = {0}  # possible numbers of printed lines that match the page's lines so far
     for line in wanted:
         if line == "...":
