@@ -115,7 +115,9 @@ def results(zoo: Path, entry: Any) -> str:
             f" {row['evaluation']['return']['mean']:.4g} |"
         )
     versions = ", ".join(f"{name} {version}" for name, version in rows[0]["versions"].items())
-    commands = list(dict.fromkeys(re.sub(r"--seed[ =]\d+", "--seed N", row["command"]) for row in rows))
+    commands: dict[str, list[str]] = {}
+    for row in rows:
+        commands.setdefault(re.sub(r"--seed[ =]\d+", "--seed N", row["command"]), []).append(str(row["seed"]))
     other_form = " (the other form)"
     said = "; ".join(
         f"`{command.removesuffix(other_form)}`"
@@ -124,7 +126,8 @@ def results(zoo: Path, entry: Any) -> str:
             if command.endswith(other_form)
             else ""
         )
-        for command in commands
+        + (f" (N = {', '.join(seeds)})" if len(commands) > 1 else "")
+        for command, seeds in commands.items()
     )
     return (
         f"{held}\n"

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import json
 import re
 import tomllib
 from collections.abc import Iterable, Iterator
@@ -541,10 +542,22 @@ def _signature(function: Any, name: str) -> str:
         stars = {"variadic positional": "*", "variadic keyword": "**"}.get(kind, "")
         keyword_only |= stars == "*"
         text = f"{stars}{parameter.name}" + (f": {parameter.annotation}" if parameter.annotation else "")
-        parts.append(text + (f" = {parameter.default}" if parameter.default is not None and not stars else ""))
+        parts.append(
+            text + (f" = {_default(function, parameter)}" if parameter.default is not None and not stars else "")
+        )
     returns = f" -> {function.returns}" if function.returns and function.name != "__init__" else ""
     line = f"{name}({', '.join(parts)}){returns}"
     return line if len(line) <= 100 else f"{name}(\n    " + ",\n    ".join(parts) + f",\n){returns}"
+
+
+def _default(function: Any, parameter: Any) -> str:
+    """Return the default of a parameter as code; for the name of a constant, its value if that is short."""
+    text = str(parameter.default)
+    if text.isidentifier():
+        value = getattr(importlib.import_module(function.module.path), text, None)
+        if type(value) in (int, float, str) and len(repr(value)) <= 30:
+            return json.dumps(value)
+    return text
 
 
 def _docstring_parts(docstring: griffe.Docstring | None) -> Iterator[str]:

@@ -161,8 +161,10 @@ def _sample_steps(env: VecEnv, resolved: Resolved) -> tuple[Matrix, Matrix, Matr
         contacts = _contacts(env)
         why = f"its default state is not an equilibrium: {moved} moves"
         if contacts:
-            why += f" (contacts there: {contacts}; a body at rest lies slightly inside the body that carries it)"
+            why += f" (contacts there: {contacts})"
         rest = "set scene.entities.NAME.init.joint_pos to a pose at rest, as `rlcli play TASK --policy zero` shows it"
+        if contacts:
+            rest += "; there a body lies slightly inside the body that carries it"
         raise _no_regulator_error(resolved, why, f"{rest}; or use --policy trained, zero or random")
     success = env.compute_success()
     if success is None or not bool(success[0]):
@@ -194,4 +196,5 @@ def _contacts(env: VecEnv) -> int:
 
 
 def _no_regulator_error(resolved: Resolved, why: str, hint: str = "use --policy trained, zero or random") -> UsageError:
-    return UsageError(f"there is no LQR (linear-quadratic regulator) of {resolved.source.name}: {why}", hint=hint)
+    name = resolved.source.name
+    return UsageError(f"an LQR (linear-quadratic regulator) of {name} cannot be computed, because {why}", hint=hint)

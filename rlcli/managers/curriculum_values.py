@@ -38,10 +38,11 @@ class TunableValues:
         """Return the tensor of a setting that may change, else `default`."""
         return self._tensors.get(path, default)
 
-    def open(self, address: str) -> Tensor:
-        """Return the tensor of a setting, through which a curriculum changes it; its shape is that of the setting.
+    def make_changeable(self, address: str) -> Tensor:
+        """Return the float32 tensor that replaces the fixed value of a setting, so that a curriculum can change it.
 
-        Terms that are bound after this call read the tensor instead of the fixed value.
+        The tensor has the shape of the setting: () for a number, (2,) for a range. The tensor of one element is a view
+        of shape () into the setting's tensor. Terms that are created after this call read the tensor.
 
         Args:
             address: dotted path of the setting, such as `rewards.alive.weight`, or of an element, `events.a.range.0`.
@@ -69,13 +70,13 @@ class TunableValues:
             value = _member(value, key)
             if _is_numeric(value):
                 try:
-                    return self._opened(path[: depth + 1], value)[tuple(int(index) for index in path[depth + 1 :])]
+                    return self._tensor(path[: depth + 1], value)[tuple(int(index) for index in path[depth + 1 :])]
                 except (ValueError, IndexError):
                     rest = ".".join(path[depth + 1 :])
                     raise NameProblem(f"a curriculum cannot change '{address}': it has no element '{rest}'") from None
         raise NameProblem(f"a curriculum cannot change '{address}': it must name a number or a list of numbers")
 
-    def _opened(self, path: Path, value: object) -> Tensor:
+    def _tensor(self, path: Path, value: object) -> Tensor:
         if path not in self._tensors:
             self._tensors[path] = torch.tensor(value, dtype=torch.float32, device=self._device)
         return self._tensors[path]

@@ -1,4 +1,8 @@
-"""Binding of terms: the names in their parameters are replaced by objects and indices when the environment is built."""
+"""Binding of terms to the compiled model, when the environment is built.
+
+To bind a term is to create it from its configuration: the names in its parameters, such as those of entities and
+joints, are replaced by objects and indices, and the result is a `BoundTerm`.
+"""
 
 from __future__ import annotations
 
@@ -268,7 +272,9 @@ class Binder:
                     path = ("curriculum", name)
                     assert config is not None
                     try:
-                        self._opened[*path, parameter.name] = self.tunable.open(config.params[parameter.name])
+                        self._opened[*path, parameter.name] = self.tunable.make_changeable(
+                            config.params[parameter.name]
+                        )
                     except NameProblem as problem:
                         self.add_problem((*path, parameter.name), str(problem), problem.hint)
 

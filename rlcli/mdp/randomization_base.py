@@ -195,7 +195,7 @@ class OrientationRandomization(DrawingTerm):
 def matching_elements(elements: list[Any], params: dict[str, Any], key: str, kind: str) -> list[Any]:
     """Return the elements of the MjSpec that a term selects; an empty list if a pattern is wrong.
 
-    A wrong pattern is reported when the term is bound.
+    A wrong pattern is reported later, when the term is created for the compiled model.
 
     Args:
         elements: all elements of a kind, such as `spec.bodies`.

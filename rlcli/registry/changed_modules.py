@@ -1,4 +1,8 @@
-"""Changes that the code of a task or plugin makes to modules of Python and of libraries, such as `time.time = None`."""
+"""Find and undo changes that the code of a task or plugin makes to modules of Python and of libraries.
+
+An example of such a change is `time.time = None`. `ModuleCopies` restores what rlcli needs to report an error.
+`change_of_module` searches the code for the line that makes the change, and returns an error that names the line.
+"""
 
 import ast
 import builtins
@@ -58,9 +62,9 @@ class ModuleCopies:
 
 
 def change_of_module(error: BaseException) -> TaskError | None:
-    """Return an error that names the line of a task's code that changes a module, the probable reason of `error`.
+    """Return an error that names the line of a task's code that changes a module, the probable reason for `error`.
 
-    Return None if no executed file of a task or plugin has such a line.
+    If several lines change modules, the error names the first one; without such a line return None.
     """
     for place, name in _changes():
         return TaskError(

@@ -39,6 +39,7 @@ class Column:
     """Column of a table: its title, and whether it contains names, numbers or sentences."""
 
     title: str
+    """Heading of the column, such as `Weight`."""
     kind: str = TEXT
     """`code` (names), `number` or `text` (sentences)."""
 
@@ -48,9 +49,11 @@ class Table:
     """Table of plain text; text between backticks is a name."""
 
     title: str
+    """Heading above the table, such as `Rewards`."""
     note: str
     """Sentence above the table; may be empty."""
     columns: tuple[Column, ...]
+    """Columns from left to right."""
     rows: tuple[tuple[str, ...], ...]
     """Cells of each row, one for each column."""
 
@@ -70,7 +73,7 @@ class Card:
 
 
 def task_card(resolved: Resolved, layout: Mapping[str, Any] | None = None) -> Card:
-    """Return the task card of a resolved configuration.
+    """Return the task card of a resolved configuration; use this function where the task is installed.
 
     Args:
         resolved: the configuration.
@@ -88,7 +91,9 @@ def card(
     source: TaskSource | None = None,
     layout: Mapping[str, Any] | None = None,
 ) -> Card:
-    """Return the task card of a configuration.
+    """Return the task card of a configuration whose task may be missing, such as the stored one of a run.
+
+    For an installed task, `task_card` calls this function with its vocabulary, name and source.
 
     Args:
         task: the configuration.

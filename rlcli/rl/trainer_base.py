@@ -66,7 +66,7 @@ class BaseTrainer(ABC):
         """Return the duration of each part of an iteration [s].
 
         Args:
-            before: `env.seconds` at the beginning of the iteration.
+            before: a copy of `env.seconds` from the beginning of the iteration.
             rollout: duration of the rollout [s].
             update: duration of the update [s].
         """

@@ -67,7 +67,8 @@ def check_formula(value: Any) -> None:
     if not isinstance(of, list) or (count is not None and len(of) != count) or not of:
         raise ValueError(f"operation '{value['op']}' takes {count or 'one or more'} operands; {_DAMAGED}")
     if own and not (isinstance(value["key"], str) and all(_are_numbers(value[key]) for key in "ab") and value["b"]):
-        raise ValueError(f"operation 'filter' needs lists of coefficients, b and a, and a key; {_DAMAGED}")
+        need = "`b` and `a` (lists of numbers, `b` not empty) and `key` (a text)"
+        raise ValueError(f"operation 'filter' needs {need}; {_DAMAGED}")
     for part in of:
         check_formula(part)
 

@@ -129,7 +129,7 @@ def find_checkpoint(
     Args:
         reference: the reference.
         runs_dir: the folder of runs.
-        task: the task that the run must be of; None: any.
+        task: name of the task that the run must have; None: any. It is not checked for the folder of a checkpoint.
         whole: whether the whole checkpoint must be valid, so that it can be resumed; otherwise only its policy.
 
     Returns:
@@ -137,6 +137,7 @@ def find_checkpoint(
 
     Raises:
         CheckpointError: if there is no such checkpoint.
+        UsageError: if the run is of another task than `task`.
     """
     from rlcli.runs.checkpoint_reader import steps
 

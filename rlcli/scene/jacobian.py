@@ -45,11 +45,19 @@ class Jacobian:
         self._sim = entity.sim
 
     def __call__(self, point: Tensor) -> Tensor:
-        """Return the Jacobian of a point, linear velocity before angular, world frame. (n, 3) -> (n, 6, k)"""
+        """Return the Jacobian of a point, world frame; see `columns`. (n, 3) -> (n, 6, k)"""
         return self.columns(point).permute(2, 1, 0)
 
     def columns(self, point: Tensor) -> Tensor:
-        """Return the columns of the Jacobian; contiguous vectors over the environments. (n, 3) -> (k, 6, n)"""
+        """Return the columns of the Jacobian of a point in the world frame, one for each joint. (n, 3) -> (k, 6, n)
+
+        n is the number of environments, k the number of joints. The 6 numbers of a column are the linear velocity of
+        the point and the angular velocity of the body, per velocity of the joint: for a hinge [m/rad, rad/rad], for a
+        slide [m/m, rad/m]. Each number is a contiguous vector over the environments.
+
+        Args:
+            point: position of the point in each environment, in the world frame [m]. (n, 3)
+        """
         axis, anchor = (self._sim.derived_vectors(name, self._joints) for name in ("xaxis", "xanchor"))
         if self._moves_body is not None:
             axis = axis * self._moves_body

@@ -116,7 +116,8 @@ def _journal(folder: Path, create: bool) -> optuna.storages.BaseStorage:
     if file.exists() and not (file.is_file() and file.stat().st_size <= _MAX_JOURNAL):
         raise CheckpointError(f"{file} is not a regular file of at most {_MAX_JOURNAL:,} bytes; choose another --name")
     if not create and not file.is_file():
-        raise CheckpointError(f"{folder} has no file {JOURNAL} with its trials; choose another --name for a new sweep")
+        message = f"the sweep {folder} is damaged: the file {JOURNAL} with its trials is missing"
+        raise CheckpointError(message, hint="restore the file, or choose another --name for a new sweep")
 
     lock: Any = FileLock(folder / f".{JOURNAL}")  # the operating system releases the lock when the process is killed
 

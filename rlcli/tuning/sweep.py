@@ -254,7 +254,7 @@ class Sweep:
     def _is_here(self, trial: FrozenTrial) -> bool:
         """Return whether a trial was started in this folder on this machine, so that it can be resumed here.
 
-        All trials of a sweep without a database were.
+        Without a database this holds for all trials of the sweep, because their list is a file in the folder.
         """
         return self.settings["storage"] is None or trial.user_attrs.get(_LOCATION) == self._here
 
@@ -297,13 +297,13 @@ def open_sweep(
 
     Args:
         folder: the folder of the sweep; created if it does not exist.
-        settings: settings of the sweep; equal in all processes, except for `trials`.
-        source: entries for the sweep's file that say where the task comes from; equal in all processes of the folder.
-        parameters: the settings that the sweep varies.
-        storage: URL of a database; None uses a journal in the folder.
+        settings: entries of `_SweepSettings`; except for `trials`, they must equal those of the existing sweep.
+        source: entries of `RecordedTask`, by which the task is found again; they must equal those in the folder.
+        parameters: the keys of the task or agent that the sweep varies, with their ranges.
+        storage: URL of a database; None: the file `JOURNAL` in the folder, to which Optuna appends each change.
 
     Raises:
-        UsageError: if the folder or the storage holds another sweep.
+        UsageError: if the folder or the storage holds a sweep with other settings, or another kind of study.
         CheckpointError: if the files of the sweep are damaged.
         MachineError: if the storage cannot be reached, or the folder cannot be written.
     """

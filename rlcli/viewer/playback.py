@@ -22,7 +22,7 @@ from rlcli.errors import CheckpointError, UsageError
 from rlcli.managers.command import CommandManager
 from rlcli.rl.action_functions import Act
 from rlcli.viewer.checkpoints import RunCheckpoints
-from rlcli.viewer.episode_history import EpisodeHistory
+from rlcli.viewer.playback_statistics import PlaybackStatistics
 from rlcli.viewer.protocol import View
 
 _log = logging.getLogger(__name__)
@@ -70,7 +70,7 @@ class Playback:
     _push: np.ndarray | None = None
     _reward: Tensor = field(init=False)
     _checkpoints: tuple[int, ...] = ()
-    history: EpisodeHistory = field(init=False)
+    statistics: PlaybackStatistics = field(init=False)
     _view: View = field(init=False)
     _commands: CommandManager | None = None
 
@@ -78,7 +78,7 @@ class Playback:
         self._commands = _commands(self.env)
         self._obs = self.env.reset(seed=self.env.seed)["policy"] if self.initial_obs is None else self.initial_obs
         self._reward = torch.zeros(self.env.num_envs)
-        self.history = EpisodeHistory(self.env)
+        self.statistics = PlaybackStatistics(self.env)
         self.refresh_checkpoints()
         self._publish()
 
@@ -159,14 +159,14 @@ class Playback:
     def reset(self) -> None:
         """Start a new episode in every environment."""
         self._obs = self.env.reset()["policy"]
-        self.history.clear_returns()
+        self.statistics.clear_returns()
         self._reward = torch.zeros(self.env.num_envs)
         self._due = 0.0
 
     def show(self, shown: int) -> None:
         """Show the environment with an index, which wraps around: -1 is the last environment."""
         self.shown = shown % self.env.num_envs
-        self.history.clear_curves()
+        self.statistics.clear_curves()
         self._push = None
 
     def hold(self, name: str, value: float | None) -> None:
@@ -248,7 +248,7 @@ class Playback:
         finally:
             self.env.pause(not playing)
         self._obs, self._reward = result.obs["policy"], result.reward
-        self.history.add(result, self.shown)
+        self.statistics.add(result, self.shown)
         self.steps += 1
 
     def _step_under_force(self, action: Tensor, push: np.ndarray) -> Any:
@@ -273,7 +273,7 @@ class Playback:
         _log.info(message)
 
     def _publish(self) -> None:
-        shown, history = self.shown, self.history
+        shown, statistics = self.shown, self.statistics
         knobs = () if self._commands is None else tuple(self._commands.knobs())
         self._view = View(
             paused=not self.env.is_playing(),
@@ -283,11 +283,11 @@ class Playback:
             episode_s=float(self.env.episode_length_buf[shown]) * self.env.step_dt,
             reward=float(self._reward[shown]),
             conditions=self.env.success_conditions(shown),
-            episode_return=float(history.returns[shown]),
-            episodes=int(history.ended[shown]),
-            succeeded=int(history.succeeded[shown]),
-            last_episode=history.last_episode(shown),
-            curves=history.curves(),
+            episode_return=float(statistics.returns[shown]),
+            episodes=int(statistics.ended[shown]),
+            succeeded=int(statistics.succeeded[shown]),
+            last_episode=statistics.last_episode(shown),
+            curves=statistics.curves(),
             checkpoint=self.checkpoint,
             checkpoints=self._checkpoints,
             follow=self.follow,

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
     from rlcli.managers.command import Knob
-    from rlcli.viewer.episode_history import RewardCurves
     from rlcli.viewer.playback import Playback
+    from rlcli.viewer.playback_statistics import RewardCurves
 
 VIEWERS = {"native": "rlcli.viewer.native:run", "web": "rlcli.viewer.web:run"}
 """Name of a viewer -> import path of the function that runs it."""

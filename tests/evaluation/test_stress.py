@@ -198,7 +198,7 @@ def test_stress_accepts_run_checkpoint_and_task(cli, only_run):
         (
             ("ant-direct", "--policy", "lqr", "--sweep", "gravity=1:2"),
             2,
-            "no LQR (linear-quadratic regulator) of ant-direct",
+            "an LQR (linear-quadratic regulator) of ant-direct cannot be computed, because",
         ),
     ],
 )

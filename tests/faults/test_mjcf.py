@@ -356,6 +356,9 @@ def test_large_model_is_first_compiled_under_limits(tmp_path, monkeypatch):
     with pytest.raises(BadModel, match=r"model\.xml: compiling takes more than"):
         read_mjcf(file, [tmp_path])
     assert os.times().children_user - begin.children_user < 5
+    monkeypatch.setattr(untrusted_mjcf, "_WALL_TIME_S", 0.01)
+    with pytest.raises(BadModel, match=r"takes more than 0.01 s; try again when the machine is less busy"):
+        read_mjcf(file, [tmp_path])
 
 
 def test_references_to_copies_cost_copies_times_references(tmp_path):

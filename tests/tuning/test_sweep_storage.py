@@ -223,7 +223,7 @@ def test_missing_journal_is_checkpoint_error(tmp_path):
     finish(open_or_join(tmp_path), 2)
     (tmp_path / JOURNAL).unlink()
     for look in (open_or_join, read_sweep):
-        with pytest.raises(CheckpointError, match=r"has no file .* with its trials"):
+        with pytest.raises(CheckpointError, match=r"the sweep .* is damaged: the file .* with its trials is missing"):
             look(tmp_path)
 
 

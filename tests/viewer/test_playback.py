@@ -204,10 +204,10 @@ def test_push_leaves_no_force_behind(playback):
 
 def test_reset_during_push_leaves_no_force(playback):
     playback.push(forces(playback.env, 1e4))
-    ended = playback.history.ended.clone()
+    ended = playback.statistics.ended.clone()
     for _ in range(40):
         playback.advance(0.1)
-    assert playback.history.ended[0] > ended[0]
+    assert playback.statistics.ended[0] > ended[0]
     assert not playback.env.engine.field("xfrc_applied").any()
 
 
@@ -264,7 +264,7 @@ def test_held_command_survives_resampling_and_reset(tmp_path):
     assert len(later) > 50
     assert bool((later[..., 0] == 0.5).all())
     assert bool((later[..., 2] == 0.0).all())
-    assert int(playback.history.ended.sum()) > 0
+    assert int(playback.statistics.ended.sum()) > 0
     playback.submit(lambda: playback.hold("vx", None))
     playback.advance(0.0)
     assert playback.view.held == {"wz": 0.0}

@@ -1,4 +1,8 @@
-"""Adapters that run terms written for Isaac Lab, `(env, target, asset_cfg)`, as terms of rlcli."""
+"""Adapters that run terms written for Isaac Lab as terms of rlcli.
+
+Such a term is a function, for example `def reward(env, target, asset_cfg)`, or a class of which the environment makes
+an object and calls it with the same arguments.
+"""
 
 from __future__ import annotations
 

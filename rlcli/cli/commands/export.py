@@ -180,10 +180,15 @@ def _export_bundle(saved: Checkpoint, run: Run | None, output: Path) -> None:
 
 
 def _find(reference: str | None, runs_dir: Path, task: str | None) -> Choice:
-    """Return the checkpoint to export, and the reason for this choice; its folder may be outside of a run.
+    """Return the checkpoint or bundle to export, and the reason for the choice; its folder may be outside of a run.
 
-    Either --checkpoint names it, or the task does: then its newest run is used. The task's code is imported only if
-    the task has no run, because a trained policy is exported without this code.
+    The code of the task is imported only for a shipped policy, a bundle, or a task without a run: the checkpoints of
+    runs are exported without this code.
+
+    Args:
+        reference: value of --checkpoint; None: the newest run, or the policy that `task` ships if it has no run.
+        runs_dir: the folder of runs.
+        task: name or folder of the task that the run must be of; None: any.
     """
     from rlcli.evaluation.session import named_task_or_run
     from rlcli.runs.policy_bundle import is_bundle

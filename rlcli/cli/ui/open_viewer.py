@@ -161,7 +161,7 @@ def _open(session: Session, name: str, reason: str, port: int | None, drawn: int
         reason=reason,
         url=address,
         steps=playback.steps,
-        episodes=int(playback.history.ended.sum()),
+        episodes=int(playback.statistics.ended.sum()),
         checkpoint=playback.checkpoint,
         chosen=session.policy.reason,
     )

@@ -1,6 +1,7 @@
 """Object with the interface of one physics engine, for environments whose engines run in several processes.
 
-Observers, recordings and reports use it like the engine of a single process.
+A shard is the part of the environments that one process steps; the main process steps the first shard.
+Observers, recordings and reports use the object like the engine of a single process.
 """
 
 from __future__ import annotations
@@ -73,7 +74,10 @@ class ShardedEngine:
 
     @property
     def history(self) -> StateHistory:
-        """History of the first shard's calls; all shards record the same number of calls."""
+        """States before the last calls of `step`, but only those of the first shard's environments.
+
+        All shards record the same number of calls; `recorded_calls` returns those of any environment.
+        """
         return self._local.history
 
     @property

@@ -253,7 +253,7 @@ class Collector:
     # --- observations and their normalisation ---
 
     def actor_input(self, obs: Mapping[str, Tensor]) -> Tensor:
-        """Return the normalised observation of the actor."""
+        """Return the group `policy`, normalised if the agent normalises observations. (n, d) -> (n, d)"""
         return obs["policy"] if self.normalizer is None else self.normalizer(obs["policy"])
 
     def _critic_input(self, obs: Mapping[str, Tensor]) -> Tensor:

@@ -1,7 +1,4 @@
-"""History of rewards and episodes during a playback, for the panels of viewers.
-
-It has the rewards of the last seconds, the returns, and how episodes ended.
-"""
+"""Statistics of a playback for the panels of viewers: rewards of the last seconds, returns, and ends of episodes."""
 
 from __future__ import annotations
 
@@ -30,7 +27,7 @@ class RewardCurves:
     """(name, points) of the reward and of each of its terms, with their weights."""
 
 
-class EpisodeHistory:
+class PlaybackStatistics:
     """Rewards of the last seconds in one environment, and episodes of all environments, for a viewer's panel."""
 
     def __init__(self, env: VecEnv) -> None:

@@ -1,4 +1,4 @@
-"""History of a playback: returns, ends of episodes, and curves of reward terms."""
+"""Statistics of a playback: returns, ends of episodes, and curves of reward terms."""
 
 import pytest
 import torch
