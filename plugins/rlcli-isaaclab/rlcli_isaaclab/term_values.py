@@ -5,13 +5,15 @@ from __future__ import annotations
 import copy
 import typing
 from collections.abc import Mapping
+from types import SimpleNamespace
 from typing import Any, get_args
 
 from rlcli.config.schema.base import Range
 from rlcli.config.term_signatures import Signature
+from rlcli_isaaclab.config_class import to_dict
 from rlcli_isaaclab.managers import SceneEntityCfg
 from rlcli_isaaclab.mdp import MdpFunction
-from rlcli_isaaclab.settings import Node, as_float
+from rlcli_isaaclab.settings import Node, as_float, to_plain
 
 
 def is_plain(value: Any) -> bool:
@@ -91,3 +93,20 @@ def type_hints(call: Any) -> dict[str, Any]:
         known_types = {"float": float, "int": int, "bool": bool, "str": str, "SceneEntityCfg": SceneEntityCfg}
         annotations: Mapping[str, Any] = getattr(call, "__annotations__", {})
         return {name: known_types.get(a) if isinstance(a, str) else a for name, a in annotations.items()}
+
+
+def set_members(target: Any, values: Mapping[str, Any]) -> None:
+    """Set the members of a configuration object to `values`. A member with an equal value keeps its type and object."""
+    for name, value in values.items():
+        now = getattr(target, name, None)
+        if isinstance(value, Mapping) and hasattr(now, "__dataclass_fields__"):
+            set_members(now, value)
+        elif to_plain(to_dict(now)) != value:
+            setattr(target, name, tuple(value) if isinstance(now, tuple) and isinstance(value, list) else value)
+
+
+def to_namespace(value: Any) -> Any:
+    """Return a dict as an object with its keys as attributes, nested dicts too; return other values unchanged."""
+    if isinstance(value, dict) and all(str(key).isidentifier() for key in value):
+        return SimpleNamespace(**{key: to_namespace(item) for key, item in value.items()})
+    return value

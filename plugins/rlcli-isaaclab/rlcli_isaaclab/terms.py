@@ -23,13 +23,12 @@ from torch import Tensor
 from rlcli.config.schema import Names, Number, StrictModel
 from rlcli.config.term_signatures import SECTIONS, Parameter, Signature, SignatureError
 from rlcli.sim.env_selection import Selection
-from rlcli_isaaclab.config_class import is_missing, to_dict
+from rlcli_isaaclab.config_class import is_missing
 from rlcli_isaaclab.direct_env import building
 from rlcli_isaaclab.managers import ManagerTermBaseCfg, SceneEntityCfg
 from rlcli_isaaclab.own_processing import call_once_per_step
-from rlcli_isaaclab.settings import to_plain
 from rlcli_isaaclab.substeps import Substeps
-from rlcli_isaaclab.term_values import resolved, type_hints
+from rlcli_isaaclab.term_values import resolved, set_members, to_namespace, type_hints
 from rlcli_isaaclab.user_files import (
     adapt_to_device,
     code_of,
@@ -185,8 +184,8 @@ class UserObject:
         values = {self.original[key]: value for key, value in params.items()}
         cfg = copy.deepcopy(getattr(getattr(self.context.cfg, self.section, None), self.name, None))
         if cfg is None:
-            return SimpleNamespace(class_type=self.function, **{k: _to_namespace(v) for k, v in values.items()})
-        _set_members(cfg, values)
+            return SimpleNamespace(class_type=self.function, **{k: to_namespace(v) for k, v in values.items()})
+        set_members(cfg, values)
         return cfg
 
 
@@ -408,23 +407,6 @@ def _bind_setting(term: SettingTerm, env: Any, **opened: Tensor) -> _BoundClass:
     facade.use(term.context)
     cfg = SimpleNamespace(func=term.function, params=term.params, setting=term.setting)
     return _BoundClass(term.function(cfg, facade), "curriculum", facade, {**term.params, **opened})
-
-
-def _set_members(target: Any, values: Mapping[str, Any]) -> None:
-    """Set the members of a configuration object to `values`. A member with an equal value keeps its type and object."""
-    for name, value in values.items():
-        now = getattr(target, name, None)
-        if isinstance(value, Mapping) and hasattr(now, "__dataclass_fields__"):
-            _set_members(now, value)
-        elif to_plain(to_dict(now)) != value:
-            setattr(target, name, tuple(value) if isinstance(now, tuple) and isinstance(value, list) else value)
-
-
-def _to_namespace(value: Any) -> Any:
-    """Return a dict as an object with its keys as attributes, nested dicts too; return other values unchanged."""
-    if isinstance(value, dict) and all(str(key).isidentifier() for key in value):
-        return SimpleNamespace(**{key: _to_namespace(item) for key, item in value.items()})
-    return value
 
 
 def _bind_term(term: UserTerm, env: Any, **params: Any) -> _Bound:
