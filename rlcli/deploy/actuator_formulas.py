@@ -27,7 +27,8 @@ def actuator_models(env: VecEnv, terms: Iterable[BoundTerm], controls: list[dict
     """
     pairs = list(zip(terms, controls, strict=False))
     known = all(control["closed"] for control in controls)
-    return [_describe(name, model, pairs, known) for name, model in env.actuators.items()]
+    models = env.actuators.items()  # a direct task may add objects that compute other things in every physics step
+    return [_describe(name, model, pairs, known) for name, model in models if isinstance(model, ActuatorModel)]
 
 
 def has_nominal_gains(model: ActuatorModel, env_id: int) -> bool:
