@@ -341,8 +341,8 @@ def _without_values(entry: Mapping[str, Any], *randomized: str) -> dict[str, Any
 
 def _differing_keys(one: Any, other: Any, path: str) -> Iterator[str]:
     if isinstance(one, dict) and isinstance(other, dict):
-        for key in {**one, **other}:
-            yield from _differing_keys(one.get(key, _ABSENT), other.get(key, _ABSENT), f"{path}.{key}")
+        for key in {**one, **other}:  # a key that one rlcli version does not have yet counts as null
+            yield from _differing_keys(one.get(key), other.get(key), f"{path}.{key}")
     elif isinstance(one, list | tuple) and isinstance(other, list | tuple) and len(one) == len(other):
         for number, pair in enumerate(zip(one, other, strict=True)):
             yield from _differing_keys(*pair, f"{path}.{number}")
@@ -351,6 +351,3 @@ def _differing_keys(one: Any, other: Any, path: str) -> Iterator[str]:
             yield path
     elif one != other:
         yield path
-
-
-_ABSENT = object()

@@ -19,9 +19,11 @@ import zoo_curves  # noqa: E402
 import zoo_pages  # noqa: E402
 
 from rlcli.config.load import resolve  # noqa: E402
+from rlcli.deploy.env_description import describe  # noqa: E402
 from rlcli.envs.make import make_env  # noqa: E402
 from rlcli.registry import find_task  # noqa: E402
 from rlcli.runs.checkpoint_reader import open_checkpoint  # noqa: E402
+from rlcli.runs.layout_and_deployment import deployment_differences  # noqa: E402
 from rlcli.runs.policy_bundle import open_bundle  # noqa: E402
 from rlcli.runs.restore import require_fit  # noqa: E402
 from rlcli.testing import check_task, lint_task  # noqa: E402
@@ -103,6 +105,7 @@ def test_shipped_policy_is_small_and_fits_task(task):
     one = resolve(find_task(task), agent=bundle.manifest["agent"], play=True, flags={"scene.num_envs": 1})
     env = make_env(one)
     require_fit(checkpoint, env.layout)
+    assert deployment_differences(checkpoint, env.layout.record(), describe(env), randomized=False) == []
     env.close()
     assert bundle.manifest["evaluation"] is not None, "export it after rlcli eval"
 
