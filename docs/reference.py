@@ -261,6 +261,9 @@ def _model(heading: str, model: dict[str, Any], links: dict[str, str]) -> Iterat
         default = "required" if key in model.get("required", ()) else f"`{_cell(yaml_text(field.get('default')))}`"
         meaning = _cell(_one_line(field.get("description", "")))
         yield f"| `{key}` | {_linked(type_text(field), links)} | {default} | {meaning} |"
+    further = model.get("additionalProperties")
+    if isinstance(further, dict):
+        yield f"| any other key | {_linked(type_text(further), links)} | | A term; the key is its name. |"
     yield ""
 
 
@@ -283,7 +286,8 @@ def _terms_index() -> Iterator[str]:
     yield "*root* is the topmost body of an entity. *Soft limits* are its joint limits, narrowed by"
     yield "[`soft_joint_pos_limit_factor`](../task-schema.md#entityconfig). A joint's `velocity_limit` is a key of"
     yield "`joints` or `actuators` of the entity. The *origin* of an environment is its start position on the terrain;"
-    yield "without a terrain it is 0.\n"
+    yield "without a terrain it is 0. In a unit such as [rad/s or m/s], rad and N m are for hinge joints, m and N for"
+    yield "slide joints.\n"
     yield "```{toctree}\n:hidden:\n\n" + "\n".join(SECTIONS) + "\n```\n"
     yield "| section | terms | contents |\n| --- | ---: | --- |"
     counts: dict[str, int] = {}
@@ -304,6 +308,12 @@ def _terms_index() -> Iterator[str]:
 def _terms_page(section: str) -> Iterator[str]:
     yield f"# {section.capitalize()}\n"
     yield f"{SECTIONS[section]} [Terms](index.md) explains *root*, *soft limits*, *velocity_limit* and *origin*.\n"
+    if section in ("observations", "actions"):
+        own = "`func` and `delay`"
+        if section == "observations":
+            own = "`func`, `modifiers`, `noise`, `bias`, `clip`, `scale`, `delay` and `history`"
+        yield f"Every term also has the keys {own}."
+        yield f"[Terms](index.md#{section}) explains them; [DelayConfig](../task-schema.md#delayconfig) is a delay.\n"
     if section in ("events", "randomization"):
         yield "`mode` says when the change is made: `startup` once, at the start; `reset` when an episode starts;"
         yield "`interval` repeatedly, and then `interval_range_s` is required: the lowest and highest time between two"

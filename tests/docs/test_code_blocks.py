@@ -72,7 +72,7 @@ RUN_BY = {
     "first-task.md: Scenes": f"{OF_PAGES}::test_scenes_of_page_build_and_run",
     "first-task.md: Events and randomisation": f"{HERE}::test_randomised_models_of_the_page_differ",
     **dict.fromkeys(
-        (f"first-task.md: {part}" for part in ("Observations", "Commands", "Actuators", "Curriculum")),
+        (f"first-task.md: {part}" for part in ("Observations", "Commands", "Actions", "Actuators", "Curriculum")),
         f"{OF_PAGES}::test_sections_of_task_page_work_together",
     ),
     "write-a-trainer.md": f"{OF_WHEELS}::test_trainer_of_page_works",

@@ -99,6 +99,7 @@ def test_sections_of_task_page_work_together(tmp_path):
     assert [list(part) for part in parts] == [
         ["observations"],
         ["commands", "observations", "rewards"],
+        ["actions"],
         ["scene", "actions"],
         ["curriculum"],
     ]

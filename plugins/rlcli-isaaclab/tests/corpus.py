@@ -17,7 +17,7 @@ import tempfile
 import threading
 import time
 import traceback
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -186,7 +186,7 @@ def isolated(limit_s: float, function: Any, *arguments: Any) -> Any:
 
 
 def write_page(rows: dict[str, Any], page: Path) -> None:
-    """Write the table of the documentation from the results. Rows of tasks that were not run stay."""
+    """Write both tables of the documentation from the results. Rows of tasks that were not run stay."""
     text = page.read_text(encoding="utf-8")
     start, end = "<!-- table -->\n", "<!-- end of table -->"
     head = [
@@ -207,7 +207,22 @@ def write_page(rows: dict[str, Any], page: Path) -> None:
         lines[name] = f"| `{name}` | {' | '.join(marks)} | {reason} |"
     before, after = text.partition(start)[0], text.partition(end)[2]
     ordered = [*head, *(lines[name] for name in sorted(lines))]
+    begin, finish = "<!-- summary -->\n", "<!-- end of summary -->"
+    opening, _, rest = before.partition(begin)
+    before = opening + begin + "\n".join(summary(lines.values())) + "\n" + finish + rest.partition(finish)[2]
     page.write_text(before + start + "\n".join(ordered) + "\n" + end + after, encoding="utf-8")
+
+
+def summary(lines: Iterable[str]) -> list[str]:
+    """Return a table with the numbers of tasks that pass each stage, from the lines of the table of tasks."""
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    table = ["| kind | tasks | with an agent | imports | validates | steps | trains |", "| --- |" + " ---: |" * 6]
+    for kind in ("manager-based", "direct"):
+        marks = [row[1 : 1 + len(STAGES)] for row in rows if ("-Direct" in row[0]) == (kind == "direct")]
+        passed = [sum(mark[i] == "yes" for mark in marks) for i in range(len(STAGES))]
+        agents = sum(mark[-1] != "no agent" for mark in marks)
+        table.append(f"| {kind} | {len(marks)} | {agents} | {' | '.join(map(str, passed))} |")
+    return table
 
 
 USUAL = (
