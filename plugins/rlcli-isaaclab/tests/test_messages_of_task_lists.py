@@ -1,6 +1,24 @@
-"""Check of the messages in the results of the whole task lists, which `corpus.py` and `all_tasks.py` print."""
+"""Checks of the results of the whole task lists: the messages, and the summary on the page and in the README."""
 
+import re
+
+from corpus import summary
+from support.fenced import REPOSITORY
 from support.task_lists import faulty_messages
+
+PAGE = REPOSITORY / "docs" / "reference" / "isaac-lab-tasks.md"
+
+
+def test_summary_of_the_page_and_figures_of_the_readme_equal_the_table_of_tasks():
+    text = PAGE.read_text(encoding="utf-8")
+    table = summary(re.findall(r"^\| `Isaac-.*", text, re.MULTILINE))
+    assert "\n".join(["<!-- summary -->", *table, "<!-- end of summary -->"]) in text
+    (tasks, agents, _, _, steps, trains), (direct, _, _, _, _, direct_trains) = (
+        re.findall(r"\d+", row) for row in table[2:]
+    )
+    readme = " ".join((REPOSITORY / "README.md").read_text(encoding="utf-8").split())
+    assert f"{steps} of Isaac Lab's {tasks} manager-based tasks step, and {trains} of the {agents} with an agent" in readme
+    assert f"so do {direct_trains} of its [{direct} direct tasks]" in readme
 
 
 def test_messages_without_a_place_in_the_task_are_faulty():
