@@ -12,7 +12,7 @@ def impossible_conditions(task: TaskConfig, layers: Layers, *, is_run: bool) -> 
     """Yield a problem for each condition of success that no episode can meet.
 
     An episode that an override, a flag or a --config file has shortened, for a quick trial, may be shorter than
-    `hold_s`, also in the run that records the trial.
+    `hold_s`, also in the run that records the trial. The default of `hold_s` is not checked.
 
     Args:
         task: the validated task.
@@ -26,8 +26,9 @@ def impossible_conditions(task: TaskConfig, layers: Layers, *, is_run: bool) -> 
         if condition is None:
             continue
         at, low, high = ("success", name), condition.at_least, condition.at_most
-        if condition.hold_s > length_s * (1.0 + 1e-9) and not is_trial:
-            path = (*at, "hold_s")
+        path = (*at, "hold_s")
+        is_given = path in layers.origins
+        if condition.hold_s > length_s * (1.0 + 1e-9) and is_given and not is_trial:
             message = f"expected at most the length of an episode, {length_s:g} s, found {condition.hold_s:g} s"
             hint = "no episode could succeed: lower hold_s, or raise episode_length_s"
             yield Problem(layers.place(path), dotted(path), message, hint)
