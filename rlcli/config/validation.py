@@ -233,6 +233,7 @@ class TaskCheck:
 
     def apply(self, changes: Iterable[Change], name: str | None) -> None:
         """Set the values of overrides and flags. `agent.KEY=VALUE` changes agent `name`; None: it is a problem."""
+        format_keys = functools.cache(formats.format_keys)  # slow: it looks for installed plugins
         for path, value, origin in changes:
             if path[0] == "agent":
                 if name is None:
@@ -241,7 +242,7 @@ class TaskCheck:
                 path = ("agents", name, *path[1:])
             # `format_keys` imports the formats, so it comes last
             unknown = foreign_keys({str(path[0]): None}).keys() - self.layers.data.keys() - {MODELS}
-            if unknown and unknown <= formats.format_keys():
+            if unknown and unknown <= format_keys():
                 message = f"the task has no settings '{path[0]}' of another framework, so nothing would read this value"
                 self.add(Problem(origin.where, messages.dotted(path), message, "remove it"))
                 continue
@@ -332,7 +333,7 @@ class TaskCheck:
         if self.problems or not isinstance(task, TaskConfig):
             return None
         task = with_terms(task, terms, params)
-        self.add(*impossible_conditions(task, self.layers, is_run=self.source.config.name == "config.yaml"))
+        self.add(*impossible_conditions(task, self.layers))
         return task
 
     def _validate(self, model: type[BaseModel], data: Any, at: Path) -> BaseModel | None:
