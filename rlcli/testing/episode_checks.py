@@ -246,9 +246,7 @@ def back_fill(subject: TaskUnderTest) -> Iterator[Finding]:
             where, values = _difference(pair.kept, f"observation '{group}'", first, second, "at its start")
             message = f"the first observation of an episode depends on the actions of the episode before: {values}"
             hint = "fill histories, delays and buffers of the reset environments in reset(selection) or reset_idx"
-            # usual in another framework's direct tasks, which keep the last actions
-            make = error_at if subject.resolved.format is None else warning_at
-            yield make(where, message, hint)
+            yield error_at(where, message, hint)
 
 
 def truncation(subject: TaskUnderTest) -> Iterator[Finding]:

@@ -39,13 +39,13 @@ def test_broken_plugins_are_reported_with_reason(broken_plugins, plugins, cli):
     broken_plugins(*names, "takes-a-built-in-name", "shares-a-name")
     trainer = "from rlcli.trainers import TrainerSpec\nSPEC = TrainerSpec('mine', {'a': 'mine:Gone'}, 'mine:Gone')\n"
     plugins("mine", trainer, entry_points="[rlcli.trainers]\nmine = mine:SPEC\n")
-    done = cli("doctor", "--json", "--probe-timeout", "30")
+    done = cli("doctor", "--json", "--probe-timeout", "15")
     found = checks(done)
     assert done.returncode == 9
     for name, state in (("crashes", "broken"), ("exits-with-0", "broken"), ("hangs", "warning")):
         row = found[f"task {name}-task"]
         assert (row["state"], BROKEN[name].said in row["found"]) == (state, True)
-    assert "slow: did not load within 30 s" in found["task hangs-task"]["found"]
+    assert "slow: did not load within 15 s" in found["task hangs-task"]["found"]
     assert found["task hangs-task"]["hint"].startswith("if the machine is busy: `rlcli doctor --probe-timeout 120`")
     assert found["trainer mine"]["state"] == "broken"
     assert "no attribute 'Gone'" in found["trainer mine"]["found"]
