@@ -255,12 +255,12 @@ def test_hook_that_breaks_a_library_is_named(with_code, start, code):
 
 def test_hook_that_breaks_a_library_in_a_worker_process_is_named(with_code, start):
     line = with_code(
-        "calculate_metrics", "self.env.shard.first and setattr(torch, 'where', None)", "num_envs: 32, workers: 2"
+        "calculate_metrics", "self.env.shard.first and setattr(torch, 'zeros', None)", "num_envs: 32, workers: 2"
     )
     process = start(*TRAIN)
     _, err = process.communicate()
     assert process.returncode == 4, err
-    assert f"coin/task.py:{line}: code of the task changes torch.where, which is probably" in err
+    assert f"coin/task.py:{line}: code of the task changes torch.zeros, which is probably" in err
 
 
 def test_thread_of_a_task_that_ends_the_command_is_named(with_code, start):

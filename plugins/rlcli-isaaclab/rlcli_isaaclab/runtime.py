@@ -261,7 +261,7 @@ class ManagerBasedRLEnv(gymnasium.Env):
         """Make the weights of all rewards changeable. Call this before the reward manager is created."""
         for name, config in self.managed.config.rewards.items():
             if config is not None:
-                self.managed._binder.tunable.open(f"rewards.{name}.weight")
+                self.managed._binder.tunable.make_changeable(f"rewards.{name}.weight")
 
     def _manager(self, name: str, kind: Any) -> Any:
         manager = getattr(self.managed, name)
