@@ -45,6 +45,36 @@ _IMPORTS = {
     "torch": f"{_STANDARD}import torch\n",
 }
 _PACKAGES = {"onnx": "numpy, mujoco, onnxruntime", "numpy": "numpy and mujoco", "torch": "numpy, mujoco and torch"}
+_ACTUATOR_MODELS = {
+    '"""\n\n': """Actuator models (`deployment.actuator_models`) need `controls` before every physics step, with the \
+newest qpos and qvel.
+\"""
+
+""",
+    "        self.action = np.zeros(": """\
+        self.substeps, self.targets = np.inf, {}  # calls of `controls` since `act`, its inputs
+        self.action = np.zeros(""",
+    """            ctrl[control["ctrl"]] = self.value(control["value"] or [], data, out)
+        return np.clip(ctrl, *self.bounds)
+""": """            now = self.targets[f"target/{control['name']}"] = self.value(control["value"] or [], data, out)
+            ctrl[control["ctrl"]] = now
+        self.ctrl, self.substeps = ctrl, 0
+        return self.controls(data)
+
+    def controls(self, data):
+        for model in self.plan["actuator_models"]:  # PD controllers and motors, at the present position and velocity
+            self.ctrl[model["ctrl"]] = self.value(model["value"], data, self.targets) if model["value"] else np.nan
+        self.substeps += 1
+        return np.clip(self.ctrl, *self.bounds)
+""",
+    "        data.ctrl[:] = controller.act(": "        controller.act(",
+    """        mujoco.mj_step(model, data, controller.metadata["decimation"])
+""": """        for _ in range(controller.metadata["decimation"]):
+            data.ctrl[:] = controller.controls(data)
+            mujoco.mj_step(model, data)
+""",
+}
+"""Lines of the template -> lines of the program for a robot with actuator models."""
 _ACT = "    def act(self, data, inputs):\n"
 _CHECK = """        sizes = SIZES
         for name, size in sizes.items():
@@ -77,11 +107,12 @@ def generate_program(policy: Path, model: Path, format_: str, metadata: dict[str
         text = text.replace(parts["onnx"], parts[format_])
     reader = "from_xml_path" if model.suffix == ".xml" else "from_binary_path"
     names = {'"policy.onnx"': literal(policy.name), '"model.xml"': literal(model.name), "from_xml_path": reader}
-    text = substitute(text, names)
+    has_actuator_models = bool((metadata["deployment"] or {}).get("actuator_models"))
+    text = substitute(text, names | (_ACTUATOR_MODELS if has_actuator_models else {}))
     # inserted last: nothing is substituted in names that come from the checkpoint
     if sizes := required_inputs(metadata):
         text = text.replace(_ACT, _ACT + _CHECK.replace("SIZES", literal(sizes)))
-    if (metadata["deployment"] or {}).get("actuator_models"):
+    if has_actuator_models:
         text = text.replace(_ACT, _ACT + _CHECK_SUBSTEPS)
     if terms := terms_of_task_code(metadata):
         text = text[: text.index(_LOOP)] + f"    sys.exit({literal('error: ' + '; '.join(terms))})\n"

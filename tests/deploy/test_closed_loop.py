@@ -382,7 +382,7 @@ def test_program_is_short_and_runs_without_rlcli(newest, tmp_path, capfd, format
     run, suffix = newest("cartpole").parent.parent, {"onnx": ".onnx", "numpy": ".py"}[format_]
     verify(capfd, run, tmp_path / f"policy{suffix}", "--format", format_, "--episodes", "2")
     file = tmp_path / "run_policy.py"
-    assert len(file.read_text().splitlines()) <= 95
+    assert len(file.read_text().splitlines()) <= 80
     assert max(map(len, file.read_text().splitlines())) <= 120
     blocked = ["rlcli", "rlcli_tasks", "torch", "pydantic", *(["onnxruntime"] if format_ == "numpy" else [])]
     command = [sys.executable, "-B", "-c", PROGRAM.format(blocked=blocked), str(file), "60"]

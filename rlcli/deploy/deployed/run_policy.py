@@ -3,7 +3,6 @@
 On a robot use `Controller`: call `reset` before an episode, then `act` every `step_dt` seconds. `data` has the fields
 that formulas read (qpos, qvel, ...; SI units, quaternions w x y z, joints at the addresses in `deployment.joints`).
 `inputs` are `command/NAME`, and `observation/NAME` without formula. Controls have the order of `deployment.actuators`.
-Actuator models (`deployment.actuator_models`) need `controls` before every physics step, with the newest qpos and qvel.
 """
 
 import json
@@ -38,7 +37,6 @@ class Controller:
 
     def reset(self):  # the first value fills a history; filters and hidden states begin at zero
         self.steps, self.filters, self.history = 0, {}, {}
-        self.substeps, self.targets = np.inf, {}  # calls of `controls` since `act`, its inputs
         self.action = np.zeros(self.metadata["outputs"]["action"]["shape"][1], np.float32)
         self.memory = {part["input"]: np.zeros(part["single"], np.float32) for part in self.metadata["memory"]}
 
@@ -65,16 +63,8 @@ class Controller:
         self.memory = {part["input"]: out[part["output"]] for part in self.metadata["memory"]}
         self.action, self.command, self.steps = out["action"][0], out["command"][0], self.steps + 1
         for control in self.plan["controls"]:
-            now = self.targets[f"target/{control['name']}"] = self.value(control["value"] or [], data, out)
-            ctrl[control["ctrl"]] = now
-        self.ctrl, self.substeps = ctrl, 0
-        return self.controls(data)
-
-    def controls(self, data):
-        for model in self.plan["actuator_models"]:  # PD controllers and motors, at the present position and velocity
-            self.ctrl[model["ctrl"]] = self.value(model["value"], data, self.targets) if model["value"] else np.nan
-        self.substeps += 1
-        return np.clip(self.ctrl, *self.bounds)
+            ctrl[control["ctrl"]] = self.value(control["value"] or [], data, out)
+        return np.clip(ctrl, *self.bounds)
 
 
 if __name__ == "__main__":
@@ -84,9 +74,7 @@ if __name__ == "__main__":
     data.qpos[:], data.qvel[:] = plan["start"]["qpos"], plan["start"]["qvel"]
     mujoco.mj_forward(model, data)
     for _ in range(steps := int((*sys.argv, "300")[1])):
-        controller.act(data, {f"command/{c['name']}": np.zeros(c["size"]) for c in plan["commands"]})
-        for _ in range(controller.metadata["decimation"]):
-            data.ctrl[:] = controller.controls(data)
-            mujoco.mj_step(model, data)
+        data.ctrl[:] = controller.act(data, {f"command/{c['name']}": np.zeros(c["size"]) for c in plan["commands"]})
+        mujoco.mj_step(model, data, controller.metadata["decimation"])
         mujoco.mj_step1(model, data)  # mj_step leaves positions and sensors of the state before it
     print(f"{steps} steps, {data.time:.2f} s; qpos", *np.round(data.qpos, 3))
