@@ -38,34 +38,51 @@ MakeFinding = Callable[[str, str, str], Finding]
 
 
 def same_seed(subject: TaskUnderTest) -> Iterator[Finding]:
-    """Check that the same seed and actions give the same trajectory, in a new environment and after reset(seed)."""
-    env, other = subject.env(episode_steps=12), subject.env(episode_steps=12)
-    first, second, third = (record_outputs(one, random_actions(one, subject.bound, 30)) for one in (env, other, env))
+    """Check that the same seed and actions give the same trajectory, in a new environment and after reset(seed).
+
+    If torch's generator alone explains a difference of another framework's task, the finding is a warning: code for
+    other frameworks has no other generator, and trainings seed it.
+    """
+    findings = _seed_differences(subject)
+    if findings and subject.resolved.format is not None:
+        others = _seed_differences(subject, seeds_torch=True)
+        hint = "nothing to do for trainings: they seed torch's generator, so that the same --seed repeats them"
+        findings = others or [
+            warning_at(each.where, f"{each.message} (from torch's generator)", hint) for each in findings
+        ]
+    yield from findings
+
+
+def _seed_differences(subject: TaskUnderTest, seeds_torch: bool = False) -> list[Finding]:
+    """Return the first difference between trajectories with the same seed and actions.
+
+    Args:
+        subject: the task.
+        seeds_torch: whether each environment and each trajectory starts with the same state of torch's generator.
+    """
+
+    def seed() -> None:
+        if seeds_torch:
+            torch.manual_seed(0)
+
+    envs = []
+    for _ in range(2):
+        seed()
+        envs.append(subject.env(episode_steps=12))
+    env, other = envs
+    trajectories = []
+    for each in (env, other, env):
+        seed()
+        trajectories.append(record_outputs(each, random_actions(each, subject.bound, 30)))
+    first, second, third = trajectories
     message = "this output of the step differs between two new environments with the same seed and actions"
-    hint = "sample with selection.uniform (normal, choice) or self.draws(env_ids), not with torch.rand or numpy"
-    findings = list(compare_trajectories(env, (first, second), message, f"{hint} or time"))
+    hint = "sample with selection.uniform (normal, choice) or self.draws(env_ids), not with torch.rand or numpy or time"
+    findings = list(compare_trajectories(env, (first, second), message, hint))
     if not findings:
         message = "this output of the step differs between a new environment and the same one after reset(seed)"
         hint = "clear all state of the last episode in the term's reset(selection), or in reset_idx"
         findings = list(compare_trajectories(env, (first, third), message, hint))
-    yield from _without_torch_draws(subject, findings) if findings else ()
-
-
-def _without_torch_draws(subject: TaskUnderTest, findings: list[Finding]) -> Iterator[Finding]:
-    """Yield the findings of `same_seed`, as warnings if torch's generator explains them in another framework's task.
-
-    Code for other frameworks draws from torch's generator, which a training seeds.
-    """
-    if subject.resolved.format is not None:
-        env, other = subject.env(episode_steps=12), subject.env(episode_steps=12)
-        trajectories = []
-        for one in (env, other):
-            torch.manual_seed(0)
-            trajectories.append(record_outputs(one, random_actions(one, subject.bound, 30)))
-        if not list(compare_trajectories(env, trajectories, "", "")):
-            hint = "nothing to do for trainings: they seed torch's generator, so that the same --seed repeats them"
-            findings = [warning_at(each.where, f"{each.message} (from torch's generator)", hint) for each in findings]
-    yield from findings
+    return findings
 
 
 def compare_trajectories(
@@ -273,12 +290,10 @@ def truncation(subject: TaskUnderTest) -> Iterator[Finding]:
     if early[0] and early[0] == early[1] and len(early[0]) == 1:
         count = early[0].pop()
         steps = f"{count} step{'s' if count > 1 else ''}"
-        message = f"every episode is truncated {steps} before its limit"
-        if count == 1 and subject.resolved.format is not None:
-            hint = "usual in the task's framework; for the full length compare the step with `>= max_episode_length`"
-            yield warning_at("terminations", message, hint)
-        else:
-            yield error_at("terminations", f"{message}; it must be truncated at its limit", hint)
+        message = f"every episode is truncated {steps} before its limit; it must be truncated at its limit"
+        if subject.resolved.format is not None:
+            hint = "compare the step with `>= max_episode_length`, not with `>= max_episode_length - 1`"
+        yield error_at("terminations", message, hint)
     elif any(early):
         message = "some episodes are truncated before their limit"
         yield warning_at("terminations", message, "use `time_out: true` only for ends that do not depend on the state")

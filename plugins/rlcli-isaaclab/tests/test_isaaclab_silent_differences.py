@@ -200,16 +200,42 @@ def test_markers_of_a_task_are_reported_once(pole, caplog):
 RANDOM = RESET + "        self.observed[env_ids] = torch.rand(len(env_ids), device=self.device)\n"
 
 
-def test_check_accepts_draws_of_torch_and_the_usual_time_out(pole, tmp_path):
-    changes = (
-        (RESET, RANDOM),
-        ("        self.observed += 1\n", ""),
-        ("episode_length_s = 0.2", "episode_length_s = 1.0"),
-    )
+LONG = (("        self.observed += 1\n", ""), ("episode_length_s = 0.2", "episode_length_s = 1.0"))
+
+
+def checked(pole, tmp_path, *changes):
+    """Write the direct task with replaced parts of its text; return check -> finding of seeds and truncations."""
     pole(*changes)
     report = check_task(f"{tmp_path}/pole/pole_env.py:PoleEnvCfg", only=["same-seed", "truncation"])
-    found = {finding.check: finding.severity for finding in report}
-    assert found == {"same-seed": "warning", "truncation": "warning"}
+    return {finding.check: finding for finding in report}
+
+
+def test_check_warns_of_draws_of_torch_and_rejects_episodes_that_end_a_step_early(pole, tmp_path):
+    found = checked(pole, tmp_path, (RESET, RANDOM), *LONG)
+    assert {check: finding.severity for check, finding in found.items()} == {
+        "same-seed": "warning",
+        "truncation": "error",
+    }
+    assert "from torch's generator" in found["same-seed"].message
+    assert "not with `>= max_episode_length - 1`" in found["truncation"].hint
+
+
+def test_check_accepts_episodes_of_full_length(pole, tmp_path):
+    assert checked(pole, tmp_path, ("self.max_episode_length - 1", "self.max_episode_length"), *LONG) == {}
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import numpy; self.observed[env_ids] = float(numpy.random.rand())",
+        "self.observed += 1 + torch.rand(1, device=self.device)",  # besides draws of torch, a state that is not reset
+        "self.resets = getattr(self, 'resets', 0) + 1; self.observed[env_ids] = float(self.resets)",
+    ],
+    ids=["numpy", "torch and a state", "a state"],
+)
+def test_check_rejects_differences_that_torchs_generator_does_not_explain(pole, tmp_path, code):
+    found = checked(pole, tmp_path, (RESET, f"{RESET}        {code}\n"), *LONG)
+    assert found["same-seed"].severity == "error"
 
 
 def test_recorded_task_of_a_package_is_named_with_its_id(package):
