@@ -266,14 +266,16 @@ def test_exception_in_task_code_names_file_and_line(in_process, tmp_path, flags)
     assert ("Traceback" in err) is bool(flags)
 
 
-def test_exception_in_rlcli_is_reported_as_bug(in_process, monkeypatch):
-    monkeypatch.setattr("rlcli.cli.commands.validate.task_source", None)
-    # the files of the tests count as code of a task here, and some of them replace functions of modules
-    monkeypatch.setattr("rlcli.cli.app.change_of_module", lambda error: None)
-    code, _, err = in_process("validate", "--deep", "cartpole")
-    assert code == 1
-    assert "this is a bug in rlcli: TypeError" in err
-    assert "Traceback" in err
+def test_exception_in_rlcli_is_reported_as_bug(here):
+    program = (
+        "import sys; from rlcli.cli.app import main; from rlcli.cli.commands import validate;"
+        "validate.task_source = None; sys.exit(main(['validate', '--deep', 'cartpole']))"
+    )
+    # a process of its own: here the files of the tests would count as code of a task, which changes modules
+    done = subprocess.run([sys.executable, "-c", program], cwd=here, capture_output=True, text=True)
+    assert done.returncode == 1
+    assert "this is a bug in rlcli: TypeError" in done.stderr
+    assert "Traceback" in done.stderr
 
 
 @pytest.mark.parametrize(

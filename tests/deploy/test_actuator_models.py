@@ -9,17 +9,15 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from support.worlds import CRITTER, build, dump
+from support.worlds import CRITTER, CRITTER_TASK, build, dump
 
 from rlcli.cli.app import main
 from rlcli.deploy import run_policy_files
 from rlcli.deploy.env_description import describe
 
-TASK = """
+LEGS = """
 summary: Legs with a DC motor, ideal PD controllers, and one actuator of MuJoCo.
-decimation: 4
 episode_length_s: 0.4
-sim: {dt: 0.005}
 scene:
   num_envs: 4
   entities:
@@ -44,6 +42,7 @@ agents:
   ppo: {trainer: ppo, algorithm: ppo, max_iterations: 1, num_steps: 4, num_minibatches: 1, torch_threads: 1,
         actor: {hidden: [8]}, critic: {hidden: [8]}, compile: false}
 """
+TASK = dump(yaml.safe_load(CRITTER_TASK) | yaml.safe_load(LEGS))
 GAINS = {"func": "randomize_pd_gains", "mode": "reset", "joints": ["hip_fl"], "stiffness": [0.5, 2.0]}
 
 
