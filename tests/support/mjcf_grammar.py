@@ -4,10 +4,7 @@ Each case is a model of a few files. A child process with limits on memory and t
 taken, or refused with one line that names a file.
 """
 
-import os
 import random
-import resource
-import signal
 import sys
 import warnings
 from pathlib import Path
@@ -18,6 +15,7 @@ import mujoco
 from rlcli.errors import Problem, one_line
 from rlcli.scene.mjcf_safety_check import BadModel
 from rlcli.scene.untrusted_mjcf import read_mjcf
+from support.case_runs import in_child
 
 RICH = """
 <mujoco model="rich">
@@ -182,39 +180,19 @@ def attempt(folder):
     return "taken"
 
 
+def write(seed, folder):
+    """Write the files of a case into a folder; return their texts."""
+    files = case(seed)
+    for name, text in files.items():
+        (folder / name).write_text(text, encoding="utf-8", errors="surrogateescape")
+    return list(files.values())
+
+
 def run(seed, folder):
     """Run a case in a child process; return its message, and what is wrong with it (empty: nothing)."""
-    for name, text in case(seed).items():
-        (folder / name).write_text(text, encoding="utf-8", errors="surrogateescape")
-    reader, writer = os.pipe()
-    child = os.fork()
-    if child == 0:
-        code = 1
-        try:
-            os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
-            signal.alarm(20 * SECONDS)  # other processes may use the cores
-            resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-            resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))
-            resource.setrlimit(resource.RLIMIT_AS, (2 * MEMORY, 2 * MEMORY))
-            message = attempt(folder)
-            code = 0
-        except BaseException as error:
-            message = f"{type(error).__name__}: {error}"
-        os.write(writer, message.encode(errors="replace")[:60_000])
-        os._exit(code)
-    os.close(writer)
-    with open(reader, "rb") as opened:
-        message = opened.read().decode(errors="replace")
-    _, status, used = os.wait4(child, 0)
-    if os.WIFSIGNALED(status):
-        return message, signal.Signals(os.WTERMSIG(status)).name
-    if os.WEXITSTATUS(status):
-        return message, "exception"
-    if used.ru_maxrss * 1024 > MEMORY:
-        return message, f"{used.ru_maxrss >> 10} MB"
-    if used.ru_utime + used.ru_stime > SECONDS:
-        return message, f"{used.ru_utime + used.ru_stime:.0f} s of processor time"
-    return message, "" if message == "taken" else complaint(message, folder)
+    write(seed, folder)
+    ended = in_child(lambda: attempt(folder), SECONDS, MEMORY)
+    return ended.text, ended.wrong or ("" if ended.text == "taken" else complaint(ended.text, folder))
 
 
 def complaint(message, folder):

@@ -158,9 +158,9 @@ def echo(line, given):
     return ""
 
 
-def complaint(code, printed, seconds, given):
+def complaint(code, printed, seconds, given, codes=CODES):
     """Return what is wrong with the result of a command; `given` are the texts of its input."""
-    if "Traceback" in printed or "bug in rlcli" in printed or code not in CODES:
+    if "Traceback" in printed or "bug in rlcli" in printed or code not in codes:
         return f"exit {code}: {printed[-300:]}"
     if seconds > SECONDS:
         return f"{seconds:.0f} s"
