@@ -68,9 +68,7 @@ def lint_task(
     evidence = RolloutEvidence(open_task(task, agent, overrides, config, num_envs, seed), seconds)
     found: list[Remark] = []
     with torch.random.fork_rng(devices=[]):
-        for name in tracked(RULES, "rules", len(RULES)):
-            if (only and name not in only) or name in ignore:
-                continue
+        for name in _with_progress([name for name in RULES if name in (only or RULES) and name not in ignore]):
             remarks = list(_apply_rule(name, evidence))
             if evidence.stopped:  # the rollouts are incomplete, so no other rule applies
                 remarks = list(_apply_rule("stops", evidence))
@@ -79,6 +77,16 @@ def lint_task(
             if evidence.stopped:
                 break
     return found
+
+
+def _with_progress(names: Sequence[str]) -> Iterator[str]:
+    """Yield the names of the rules, and report progress from the second rule on.
+
+    The first rule records the rollouts, which take most of the time and report their own progress. As a part of one
+    rule out of many, they would give a far too long estimate of the time left.
+    """
+    yield from names[:1]
+    yield from tracked(names[1:], "rules", len(names) - 1)
 
 
 def _apply_rule(name: str, evidence: RolloutEvidence) -> Iterator[Remark]:

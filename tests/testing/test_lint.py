@@ -1,10 +1,12 @@
 """The linter finds each planted defect with its rule and place, and nothing in correct tasks."""
 
+import contextlib
 import json
 from pathlib import Path
 
 import pytest
 
+from rlcli import progress
 from rlcli.cli.app import main
 from rlcli.testing import RULES, lint_task
 
@@ -395,3 +397,16 @@ def test_command_rejects_unknown_rule_task_and_time(managed, capsys):
     assert command(capsys, folder, "--seconds", "-1")[0] == 2
     assert command(capsys, "cartpoel")[0] == 4
     assert command(capsys, folder, "decimation=0")[0] == 3
+
+
+def test_progress_counts_rollouts_before_rules(managed, monkeypatch):
+    ended = []
+
+    @contextlib.contextmanager
+    def view(running):
+        yield
+        ended.append(running[0].what)  # the outermost operation, which is not shown as a part of another one
+
+    monkeypatch.setattr(progress, "view", view)
+    lint(managed)
+    assert [name for name in ended if name in ("policies", "rules")] == ["policies", "rules"]
