@@ -1,4 +1,4 @@
-"""Adapters that give a `VecEnv` the interface of Gymnasium, Stable-Baselines3 or RSL-RL.
+"""Adapters that give rlcli's environments the interface of Gymnasium, Stable-Baselines3 or RSL-RL.
 
-Each adapter serves one learning library, whose own scripts can then train in a task of rlcli.
+With an adapter, training scripts of these libraries can use a task of rlcli.
 """

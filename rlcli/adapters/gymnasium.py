@@ -75,7 +75,8 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
     Args:
         env: the environment.
         autoreset_mode: the mode, or its value as text: "SameStep", "NextStep", "Disabled".
-        action_bound: limit of the action space (+-) if the task has none; None: unbounded.
+        action_bound: the action space is [-action_bound, action_bound] if the task has no action limits of its own;
+            None: unbounded.
         render_mode: "rgb_array" for images of the first environment; None for no images.
     """
 
@@ -103,7 +104,10 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.ended: NDArray[np.bool_] = np.zeros(self.num_envs, dtype=bool)
-        """Whether the episode has ended and waits for a reset; always false in the mode SAME_STEP. (num_envs,) bool"""
+        """Whether an environment's episode has ended and no new one was started. (num_envs,) bool
+
+        Always false in the mode SAME_STEP.
+        """
         # The `VecEnv` resets an ended environment within the step. The first observation of the new episode is kept
         # here until Gymnasium's mode allows it to be returned.
         self._first: Floats | None = None
@@ -113,13 +117,19 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
         """Start new episodes in all environments, or in those where `options["reset_mask"]` is true.
 
-        One seed is enough: each environment has its own random stream.
+        Args:
+            seed: one number for all environments, each of which derives its own random stream from the number; None:
+                the seed stays, and the next episodes start.
+            options: None, or a dict with `reset_mask`, an array (num_envs,) bool. Other keys are not read.
 
         Returns:
-            Observations (num_envs, d) float32, infos.
+            Observations (num_envs, d) float32 and an empty dict. Where the mask is false, the observations are those
+            of the last step.
 
         Raises:
-            ValueError: if the mask is true for an environment whose episode has not ended.
+            TypeError: if `seed` is not an integer.
+            ValueError: if the mask has another shape, is true for an environment whose episode has not ended, or is
+                passed before the first reset.
         """
         if seed is not None and not isinstance(seed, int | np.integer):
             raise TypeError(f"seed must be one number for all environments, found {seed!r}")
@@ -139,7 +149,8 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
 
         Returns:
             Observations (num_envs, d) float32, rewards (num_envs,) float64, terminated and truncated (num_envs,) bool,
-            infos.
+            and infos. The infos have `success` (num_envs,) bool of the ended episodes, if the task has success
+            conditions; in the mode SAME_STEP they have Gymnasium's keys `final_obs` and `final_info`.
 
         Raises:
             RuntimeError: in mode DISABLED, if an episode has ended and no new one was started.
@@ -169,9 +180,9 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         return obs.copy(), result.reward.cpu().numpy().astype(np.float64), terminated, truncated, infos
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
-        """Return a tuple with one image, of the first environment; None without a `render_mode`.
+        """Return a tuple with one image of the first environment, uint8 (height, width, 3).
 
-        The image is uint8 (height, width, 3).
+        Return None if the environment was created without a `render_mode`.
         """
         return None if self.render_mode is None else (self._camera.image(),)
 
@@ -196,7 +207,10 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         return self._last_obs.copy()
 
     def _infos(self, result: StepResult) -> dict[str, Any]:
-        """Return the infos of a step: `success` of ended episodes, and `_success`, true where there is a value."""
+        """Return the infos of a step: `success` of ended episodes, and `_success`, true where an episode ended.
+
+        The dict is empty if no episode ended or the task has no success conditions.
+        """
         if result.episodes is None or result.episodes.success is None:
             return {}
         ended = result.episodes.ended()
@@ -207,7 +221,10 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         return {"success": success, "_success": known} if known.any() else {}
 
     def _final_infos(self, result: StepResult, infos: dict[str, Any]) -> dict[str, Any]:
-        """Return the infos `final_obs` and `final_info` of ended episodes, in the form of Gymnasium's SAME_STEP."""
+        """Return the infos `final_obs` and `final_info` of ended episodes, in the form of Gymnasium's SAME_STEP.
+
+        `infos` is the result of `_infos`, whose `success` becomes part of `final_info`.
+        """
         if result.episodes is None or result.final_obs is None:
             return {}
         final = _policy_obs(result.final_obs)
@@ -223,8 +240,12 @@ class GymnasiumEnv(gymnasium.Env):
 
     Args:
         env: a `VecEnv` with one environment.
-        action_bound: limit of the action space (+-) if the task has none; None: unbounded.
-        render_mode: "rgb_array" or None.
+        action_bound: the action space is [-action_bound, action_bound] if the task has no action limits of its own;
+            None: unbounded.
+        render_mode: "rgb_array" for images; None for no images.
+
+    Raises:
+        ValueError: if `env` has several environments, or for another `render_mode`.
     """
 
     metadata: dict[str, Any]
@@ -252,7 +273,8 @@ class GymnasiumEnv(gymnasium.Env):
         """Step the environment. action (a,)
 
         Returns:
-            Observation (d,) float32, reward, terminated, truncated, infos.
+            Observation (d,) float32, reward, terminated, truncated, and infos: `success` of an ended episode, if the
+            task has success conditions.
 
         Raises:
             RuntimeError: if the episode has ended and `reset` was not called.
@@ -264,7 +286,7 @@ class GymnasiumEnv(gymnasium.Env):
         return obs[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
 
     def render(self) -> NDArray[np.uint8] | None:
-        """Return an image, uint8 (height, width, 3); None without a `render_mode`."""
+        """Return an image of the current state, uint8 (height, width, 3); None without a `render_mode`."""
         images = self._vector.render()
         return None if images is None else images[0]
 
@@ -283,7 +305,10 @@ def make_vector(
     render_mode: str | None = None,
     **settings: Any,
 ) -> GymnasiumVectorEnv:
-    """Return a vector environment; `gym.make_vec` calls it. Arguments: see `open_task` and `GymnasiumVectorEnv`."""
+    """Return a vector environment of a task; `gym.make_vec` calls this function.
+
+    The arguments are those of `open_task` and `GymnasiumVectorEnv`; `settings` are `agent`, `seed` and `device`.
+    """
     env = open_task(task, num_envs, cfg, **settings)
     return GymnasiumVectorEnv(env, autoreset_mode, action_bound=action_bound, render_mode=render_mode)
 
@@ -296,7 +321,10 @@ def make_single(
     render_mode: str | None = None,
     **settings: Any,
 ) -> GymnasiumEnv:
-    """Return a single environment; `gym.make` calls it. Arguments: see `open_task` and `GymnasiumEnv`."""
+    """Return a single environment of a task; `gym.make` calls this function.
+
+    The arguments are those of `open_task` and `GymnasiumEnv`; `settings` are `agent`, `seed` and `device`.
+    """
     return GymnasiumEnv(open_task(task, 1, cfg, **settings), action_bound=action_bound, render_mode=render_mode)
 
 
@@ -306,7 +334,11 @@ def observation_space(env: VecEnv) -> spaces.Box:
 
 
 def action_space(env: VecEnv, action_bound: float | None = 1.0) -> spaces.Box:
-    """Return the action space of one environment: the direct task's `action_limits`, else +-`action_bound`. (a,)"""
+    """Return the action space of one environment, float32 (a,).
+
+    The bounds are the attribute `action_limits` of a direct task; in other tasks -`action_bound` and `action_bound`, or
+    none if `action_bound` is None.
+    """
     limits = getattr(getattr(env, "task", None), "action_limits", ())
     size = env.layout.action_size
     if len(limits) == size:
@@ -317,7 +349,7 @@ def action_space(env: VecEnv, action_bound: float | None = 1.0) -> spaces.Box:
 
 
 class _Camera:
-    """Renderer for `render()` of the first environment; it opens OpenGL at the first image."""
+    """Renderer of images of the first environment; OpenGL is initialized when the first image is rendered."""
 
     def __init__(self, env: VecEnv) -> None:
         self._env = env

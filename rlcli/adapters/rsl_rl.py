@@ -14,9 +14,9 @@ from rlcli.rl.episode_statistics import EpisodeStatistics
 class RslRlVecEnv(RslRlBase):  # type: ignore[misc]  # RSL-RL has no types
     """Environment for RSL-RL's runners, with all observation groups of a `VecEnv`.
 
-    The first call of `get_observations` starts the first episodes. `extras["time_outs"]` marks episodes that were
-    truncated and not terminated; RSL-RL then bootstraps from the observation before the step. The last observations of
-    episodes are in `extras["final_obs"]`, which RSL-RL does not read.
+    The first call of `get_observations` starts the first episodes. The extras of `step` have `time_outs`, true for
+    episodes that were truncated and not terminated; for these, RSL-RL bootstraps from the value of the observation
+    before the step. The last observations of episodes are in `extras["final_obs"]`, which RSL-RL does not read.
 
     Args:
         env: the environment.
@@ -58,7 +58,8 @@ class RslRlVecEnv(RslRlBase):  # type: ignore[misc]  # RSL-RL has no types
         """Step all environments. actions (num_envs, a)
 
         Returns:
-            Observations, rewards (num_envs,), dones (num_envs,) int64, and extras, as RSL-RL's `VecEnv.step` does.
+            Observations by group, rewards (num_envs,), dones (num_envs,) int64, and extras. The extras have `time_outs`
+            (num_envs,) bool and, in steps in which episodes end, `final_obs` and `log` (statistics of these episodes).
         """
         if self._obs is None:
             self.get_observations()
@@ -74,11 +75,11 @@ class RslRlVecEnv(RslRlBase):  # type: ignore[misc]  # RSL-RL has no types
         return self._obs, result.reward, (result.terminated | result.truncated).long(), extras
 
     def observations(self, groups: dict[str, Tensor]) -> TensorDict:
-        """Return observation groups as the `TensorDict` that RSL-RL uses."""
+        """Return observation groups, tensors (num_envs, d) by name, as the `TensorDict` that RSL-RL uses."""
         return TensorDict(dict(groups), batch_size=[self.num_envs], device=self.device)
 
     def zero_observations(self) -> TensorDict:
-        """Return observations that are all zero, for code that needs their shapes."""
+        """Return observations of all groups that are zero, for code that only needs their shapes. (num_envs, d) each"""
         layout = self.unwrapped.layout
         return self.observations(
             {group: torch.zeros(self.num_envs, layout.size(group), device=self.device) for group in layout.observations}

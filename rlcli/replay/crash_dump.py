@@ -1,6 +1,6 @@
-"""Crash dumps: files with the last physics steps before a simulation diverged, which `rlcli replay` simulates again.
+"""Write crash dumps: files with the last physics steps before a divergence, which `rlcli replay` simulates again.
 
-The steps are stored as engine calls: each one simulates one or more physics steps from a state
+The steps are stored as engine calls. An engine call simulates one or more physics steps from a state
 (`rlcli.sim.divergence_report.Call`).
 """
 
@@ -32,12 +32,12 @@ CALLS = 64
 
 
 class CrashDumper(StepObserver):
-    """Observer that writes a crash dump when an environment diverges for the first time, and logs a warning.
+    """Observer that writes a crash dump at the first divergence of any environment, and logs a warning.
 
     Args:
-        env: the environment; its engine is set to keep the last calls.
+        env: the environments; their engine is set to keep its last `CALLS` calls.
         folder: folder of the dump; created with the dump.
-        parents: whether missing folders above it are created, too.
+        parents: whether missing folders above `folder` are created, too.
     """
 
     def __init__(self, env: Environment, folder: Path, *, parents: bool = False) -> None:
@@ -47,7 +47,10 @@ class CrashDumper(StepObserver):
         env.observers.add(self)
 
     def on_divergence(self, found: list[Divergence], pending: bool) -> None:
-        """Write the crash dump of the first divergence, log a warning, and stop observing divergences."""
+        """Write the crash dump of the first divergence, log a warning, and stop observing divergences.
+
+        On a GPU, or after a disk error, there is no dump, and the warning says why. For the arguments see `write_dump`.
+        """
         if not found:
             return
         env = self._env
@@ -67,7 +70,7 @@ class CrashDumper(StepObserver):
 
 
 def stop_observing_divergences(env: Environment, observer: StepObserver) -> None:
-    """Remove an observer of divergences. After the last one, the engine keeps no more than its newest call."""
+    """Remove an observer of divergences; if no other one is left, set the engine to keep only its newest call."""
     env.observers.remove(observer)
     if not env.observers.on_divergence and env.engine.replayable is not None:
         env.engine.replayable.record_calls(1)
@@ -75,30 +78,33 @@ def stop_observing_divergences(env: Environment, observer: StepObserver) -> None
 
 @dataclass(slots=True)
 class CallTrace:
-    """Copies of the last engine calls of one environment, from which another thread can simulate them again."""
+    """Copies of the last engine calls of one environment, from which another thread can simulate the calls again."""
 
     divergence: Divergence
     """The divergence. For an episode that did not diverge, `divergence.cause` is why the episode was recorded."""
     calls: list[Call]
+    """The calls, oldest first."""
     final: NDArray[np.float64]
-    """The state after the last call, or before it if that call is pending."""
+    """The integration state after the last call; before the last call, if that call is pending. (nstate,)"""
     own_model: dict[str, Tensor]
-    """Model fields that differ between environments, with this environment's values."""
+    """Fields of the model that differ between environments, with this environment's values, by name."""
     last: int
-    """Number of calls in the last environment step."""
+    """How many of the calls belong to the last environment step."""
     pending: bool
-    """Whether the engine has not made the last call yet."""
+    """Whether the divergence was found before the last call, which the engine therefore has not made."""
 
 
 def trace_calls(env: Environment, divergence: Divergence, pending: bool = False) -> CallTrace:
-    """Copy the last engine calls (calls that simulate physics steps) of an environment that has diverged.
+    """Copy the last engine calls (calls that simulate physics steps) of an environment.
 
-    It must be called before the environment's state is restored or reset.
+    Call this function before the environment's state is restored or reset.
 
     Args:
         env: all environments.
-        divergence: the divergence, with the index of its environment.
-        pending: whether the engine has not made the call that diverges yet.
+        divergence: the divergence, with the index of its environment; for an episode that did not diverge, the cause
+            is why the episode is recorded.
+        pending: whether the divergence was found before the engine's next call; that call then becomes part of the
+            copies.
     """
     engine, number = env.engine.replayable, divergence.env
     assert engine is not None
@@ -116,11 +122,12 @@ def describe_traces(
     """Simulate engine calls again, and convert them to the form of a trajectory file.
 
     Args:
-        traces: the calls of each environment.
+        traces: the copied calls, one item for each environment.
         model: the model of all environments.
         resolved: the configuration.
-        follows_constants: whether MuJoCo's constants are derived again from an environment's model fields.
-        diverged: whether the traces end in a divergence, whose physics step is then searched.
+        follows_constants: whether the constants that MuJoCo derives from a model (`mj_setConst`) are derived again from
+            each environment's own model fields.
+        diverged: whether the calls end in a divergence; its physics step is then searched.
 
     Returns:
         The `World` of each environment for the file's header, and the file's tensors (`world.K.*`), by name.
@@ -153,17 +160,18 @@ def write_dump(env: Environment, found: list[Divergence], pending: bool, folder:
     """Write a crash dump with the last engine calls of the environments that diverged.
 
     Args:
-        env: the environment, before the diverged states are restored.
-        found: the divergences.
-        pending: whether the engine has not made the call that diverges yet.
+        env: the environments, before the diverged states are restored.
+        found: the divergences; only the first `MAX_DESCRIBED` are written.
+        pending: whether the divergences were found before the engine's next call; that call is then simulated for the
+            dump.
         folder: folder of the file; created if it does not exist.
-        parents: whether missing folders above it are created, too.
+        parents: whether missing folders above `folder` are created, too.
 
     Returns:
-        The file. Its name is new: an older dump of the same step stays.
+        The written file. No existing file is overwritten.
 
     Raises:
-        MachineError: if the disk reports an error, or the folder is a link.
+        MachineError: if the disk reports an error, the folder is a link, or it is full of dumps of this step.
     """
     if folder.is_symlink():  # the link may come from an unpacked archive and lead anywhere
         raise MachineError(f"{folder} is a link, through which rlcli does not write; remove it")
@@ -179,6 +187,6 @@ def write_dump(env: Environment, found: list[Divergence], pending: bool, folder:
     files = (folder / f"{name}.safetensors" for name in names)
     file = next((file for file in files if not os.path.lexists(file)), None)
     if file is None:
-        raise MachineError(f"{folder} has 10,000 dumps of step {env.common_step}; remove some")
+        raise MachineError(f"{folder} already has 9,999 crash dumps of step {env.common_step}; remove some of them")
     write_trajectory(file, header, tensors, parents=parents)
     return file

@@ -1,9 +1,9 @@
-"""Repetition of one episode of `rlcli eval` from its seed: episode K of environment E.
+"""Repeat one episode of `rlcli eval` from the seed: episode K of environment E, for `rlcli play`.
 
 A random number depends on the seed, the term, the environment and the index of its episode. If nothing else connects
 the episodes of a task, episode K starts at once. In other tasks an episode also depends on the earlier ones, because of
 noise, curricula, terms with a state, or timers that a reset does not restart. Then the episodes before K are run first,
-in all environments as in the evaluation, and the reasons are reported.
+in all environments as in the evaluation, and the reasons are returned.
 """
 
 from dataclasses import dataclass
@@ -26,16 +26,16 @@ class EpisodeStart:
     obs: Tensor
     """Observations of the policy. (num_envs, d)"""
     episodes_before: int
-    """Number of earlier episodes of this environment that were run before."""
+    """Number of earlier episodes of this environment that had to be run first; 0 if the episode started at once."""
     reasons: list[str]
-    """Reasons why episode K could not start at once; empty if it did."""
+    """Reasons why earlier episodes had to be run first; empty if the episode started at once."""
     generators: dict[str, Tensor]
-    """States of the global random generators, which all environments share, before any step."""
+    """States of the global random generators (of torch, numpy and Python) before any step, by name."""
 
     def shared_draws(self) -> bool:
-        """Return whether the task has drawn random numbers from global generators since the start.
+        """Return whether the task has drawn random numbers from the global generators of torch, numpy or Python.
 
-        Then the episode also depends on the number of environments.
+        All environments share these generators; an episode then also depends on the number of environments.
         """
         return _has_drawn(self.generators)
 
@@ -45,13 +45,16 @@ def start_episode(env: VecEnv, act: Act, env_id: int, episode: int, *, drawn_act
 
     Args:
         env: the environments, newly created.
-        act: the policy, a function from observations to actions.
-        env_id: the environment of the episode.
-        episode: its index, from 0.
+        act: the policy, a function from observations (num_envs, d) to actions (num_envs, a).
+        env_id: index of the episode's environment.
+        episode: index of the episode in this environment, from 0.
         drawn_actions: whether the policy draws random numbers (a stochastic policy, or random actions).
 
+    Returns:
+        The first observations of the episode, and which earlier episodes were run, and why.
+
     Raises:
-        ConfigError: if an episode does not end because the task has no time-out.
+        ConfigError: if an earlier episode does not end, because the task has no time-out.
     """
     reasons = [*env.episode_dependencies(), *(["randomly sampled actions"] if drawn_actions else [])]
     generators, start = rng_state(), env.state_dict()
@@ -69,7 +72,13 @@ def start_episode(env: VecEnv, act: Act, env_id: int, episode: int, *, drawn_act
 
 
 def run_episode(env: VecEnv, act: Act, obs: Tensor, env_id: int) -> StepResult:
-    """Run the policy until the present episode of environment `env_id` ends, and return the last step.
+    """Run the policy until the current episode of environment `env_id` ends, and return the result of the last step.
+
+    Args:
+        env: the environments; all of them step.
+        act: the policy, a function from observations (num_envs, d) to actions (num_envs, a).
+        obs: the current observations of the policy. (num_envs, d)
+        env_id: index of the environment.
 
     Raises:
         ConfigError: if the episode does not end, because the task has no time-out.
@@ -84,10 +93,10 @@ def run_episode(env: VecEnv, act: Act, obs: Tensor, env_id: int) -> StepResult:
 
 
 def require_end(env: Environment, length: int) -> None:
-    """Check that an episode, which has had `length` steps so far, is not much longer than episode_length_s.
+    """Check that a running episode of `length` steps is not longer than `PATIENCE` times `episode_length_s`.
 
     Raises:
-        ConfigError: if the episode is much longer, because the task has no time-out.
+        ConfigError: if the episode is longer; the task then has no time-out.
     """
     if length > PATIENCE * env.max_episode_length:
         message = f"an episode has lasted {length} steps, {PATIENCE} times episode_length_s, and has not ended"
@@ -96,6 +105,6 @@ def require_end(env: Environment, length: int) -> None:
 
 
 def _has_drawn(before: dict[str, Tensor]) -> bool:
-    """Return whether random numbers were drawn from the global generators since they had the states `before`."""
+    """Return whether random numbers were drawn from the global generators since their states were `before`."""
     after = rng_state()
     return any(not torch.equal(before[name].nan_to_num(-1.0), after[name].nan_to_num(-1.0)) for name in before)

@@ -17,12 +17,14 @@ from rlcli.replay.trajectory import STATE_FIELDS, Episode, Header, write_traject
 
 
 class EpisodeRecorder(StepObserver):
-    """Observer that records episodes, from the first step inside its `with` block on.
+    """Observer that records the first complete episodes after it is added to the environments.
+
+    Use it with `with env.observers.added(recorder):` from the beginning of an episode on.
 
     Args:
-        env: the environment.
+        env: the environments.
         episodes: number of episodes, divided evenly between the environments, as in an evaluation.
-        env_id: the environment from which all episodes are taken; None: from all environments.
+        env_id: index of the environment from which all episodes are taken; None: from all environments.
     """
 
     def __init__(self, env: VecEnv, episodes: int, *, env_id: int | None = None) -> None:
@@ -42,7 +44,7 @@ class EpisodeRecorder(StepObserver):
         """The recorded episodes, in the order in which they ended."""
 
     def before_step(self) -> None:
-        """Copy the initial state of new episodes."""
+        """Copy the state and model fields at the beginning of new episodes."""
         if not self._start:
             self._start = self._env.state_dict()
         if not self._new:
@@ -56,11 +58,11 @@ class EpisodeRecorder(StepObserver):
         self._new = []
 
     def after_physics(self) -> None:
-        """Copy the state after the step, before any reset."""
+        """Copy the state after the physics steps, before any reset."""
         self._after.append(read_state(self._env))
 
     def on_step(self, record: StepRecord) -> None:
-        """Copy actions and rewards, and add the episodes that end."""
+        """Copy actions and rewards, and add the episodes that end in this step to `episodes`."""
         self._actions.append(record.action.detach().cpu().clone())
         self._rewards.append(record.reward.detach().cpu().clone())
         if record.episodes is None:
@@ -73,7 +75,10 @@ class EpisodeRecorder(StepObserver):
                 self.episodes.append(Episode.of(self._env, ended, row, begin=self._begin[env]))
 
     def save(self, files: Mapping[str, Path]) -> list[Path]:
-        """Write the recorded episodes. `files` maps `all`, `succeeded` or `failed` to the file of these episodes.
+        """Write the recorded episodes to one file or several.
+
+        Args:
+            files: which episodes -> the file for these episodes; the keys are `all`, `succeeded` and `failed`.
 
         Returns:
             The files that were written.

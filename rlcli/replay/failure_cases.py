@@ -1,7 +1,7 @@
-"""Failure cases: recordings of failed and outlier episodes of a training, as `rlcli autopsy` reads and shows them.
+"""Read failure cases, the recordings of failed and outlier episodes of a training, for `rlcli autopsy`.
 
-Reading and listing them executes no code. `stage_case` builds the task to draw contacts, and so runs the task's code,
-which must be trusted (`rlcli.runs.trusted_tasks`).
+Reading and listing failure cases executes no code. `stage_case` builds the task to compute contacts and images, and so
+runs the task's code, which must be trusted (`rlcli.runs.trusted_tasks`).
 """
 
 import logging
@@ -35,6 +35,7 @@ class FailureCase:
     """Recording of the last steps of a failed or outlier episode of a training."""
 
     trajectory: Trajectory
+    """Content of the file, with one episode and the engine calls of its environment."""
 
     @property
     def episode(self) -> Episode:
@@ -50,17 +51,17 @@ class FailureCase:
 
     @property
     def world(self) -> World:
-        """The recorded engine calls, each of which simulates physics steps of the recorded steps."""
+        """The engine calls that simulated the recorded environment steps."""
         return self.trajectory.header.worlds[0]
 
     @property
     def ended_by(self) -> str:
-        """What ended the episode: the names of the terminations, or the cause of the divergence."""
+        """What ended the episode: the names of the terminations, or the cause of the divergence, as one text."""
         return self.world.ended_by if self.failure.kind == "diverged" else ", ".join(self.episode.causes)
 
     @property
     def seconds(self) -> float:
-        """Duration of the recorded steps [s]."""
+        """Simulated time of the recorded steps [s]."""
         return self.episode.kept * self.trajectory.header.step_dt
 
     @property
@@ -78,15 +79,15 @@ class FailureCase:
         return array
 
     def columns(self, name: str) -> dict[str, NDArray[np.float32]]:
-        """Return the recorded values of each column, (steps,), by the name of the column.
+        """Return the recorded values (steps,) of each column of the observations, actions or reward terms, by name.
 
-        `name` chooses the kind of columns: observations, actions or reward_terms.
+        `name` is `observations`, `actions` or `reward_terms`.
         """
         names = getattr(self.trajectory.header.columns, name)
         return dict(zip(names, self.values(name).T, strict=True))
 
     def record(self) -> dict[str, Any]:
-        """Return the recording as JSON data, without the values of its steps: why, when and where it was recorded."""
+        """Return why, when and where the episode was recorded, as JSON data for `rlcli autopsy --json`."""
         episode, failure = self.episode, self.failure
         facts = {
             "file": str(self.trajectory.file),
@@ -108,7 +109,10 @@ class FailureCase:
         return finite
 
     def series(self) -> dict[str, Any]:
-        """Return the values of every recorded step as plain JSON: time, reward, reward_terms, observations, actions."""
+        """Return the values of all recorded steps as JSON data: time, reward, reward_terms, observations, actions.
+
+        Each value is a list over the steps; reward_terms, observations and actions have one list for each column.
+        """
         values = {
             "time": self.times.tolist(),
             "reward": self.values("rewards").tolist(),
@@ -122,7 +126,9 @@ class FailureCase:
 
 
 def list_failure_cases(run: Run) -> list[FailureCase]:
-    """Return the failure cases of a run, the oldest first; a file that cannot be read is skipped with a warning.
+    """Return the failure cases of a run, the oldest first; at most 10,000 files are read.
+
+    A file that cannot be read, or is no failure case, is skipped with a warning.
 
     Raises:
         CheckpointError: if the folder of failure cases is outside the run.
@@ -148,7 +154,7 @@ def list_failure_cases(run: Run) -> list[FailureCase]:
 
 
 def why_no_cases(run: Run) -> str:
-    """Return one sentence that explains to the user why a run has no failure cases."""
+    """Return one sentence for the user on why a run has no failure cases; call it only for such a run."""
     device = str(run.record.get("device", "cpu"))
     if device.startswith("cuda"):
         return (
@@ -163,8 +169,9 @@ class Contact:
     """Two geoms in contact, with the contact force."""
 
     geoms: tuple[str, str]
+    """Names of the two geoms."""
     distance: float
-    """Distance between the geoms; negative if they penetrate [m]."""
+    """Distance between the geoms [m]; negative if they penetrate each other."""
     force: float
     """Force along the contact normal [N]."""
     position: tuple[float, float, float]
@@ -173,20 +180,20 @@ class Contact:
 
 @dataclass(frozen=True, slots=True)
 class StagedCase:
-    """A failure case, and a simulation of its task as it is installed now, which computes contacts and images."""
+    """A failure case together with a simulation of the installed task, to compute contacts and images."""
 
     staged: Staged
     states: list[NDArray[np.float64]]
-    """States at the beginning of each kept step and after the last one, without states that are not finite."""
+    """Finite states at the beginning of each recorded step; without a divergence also the state after the last step."""
 
     def forward(self, number: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
-        """Return MuJoCo's model, and its data at the recorded state `number`, with all derived fields computed."""
+        """Return MuJoCo's model, and its data for `states[number]` with all derived fields computed."""
         engine = self.staged.worlds[0].world.engine
         engine.set_state_row(0, self.states[number])
         return engine.world(0)
 
     def contacts(self) -> list[Contact]:
-        """Return the contacts of the last state, the strongest first."""
+        """Return the contacts in the last recorded state, the largest force first."""
         model, data = self.forward(-1)
         found = []
         force = np.zeros(6)
@@ -208,13 +215,15 @@ def stage_case(case: FailureCase, named: TaskSource | None = None) -> StagedCase
             example after the task's folder was moved. None: no task was named.
 
     Raises:
-        CheckpointError, ConfigError, TaskError: see `rlcli.replay.resimulate.stage`.
+        CheckpointError: if the case has no finite state, or does not fit the installed task.
+        ConfigError, TaskError: see `rlcli.replay.resimulate.stage`.
     """
     torch.set_num_threads(1)
     staged = stage(case.trajectory, named)
     if not staged.same_model:
         _log.warning(
-            "the installed task's model differs from the one in training: contacts and images show the installed one"
+            "the model of the installed task differs from the model in training: contacts and images show the"
+            " installed model"
         )
     first, calls = case.world.first, staged.worlds[0].calls
     calls_per_step = max(1, first // max(1, case.episode.kept - 1))
@@ -228,7 +237,7 @@ def stage_case(case: FailureCase, named: TaskSource | None = None) -> StagedCase
 
 
 def _geom_name(model: mujoco.MjModel, index: int) -> str:
-    """Return the name of a geom; if it has none, its index and the name of its body."""
+    """Return the name of a geom; of a geom without a name, its index and the name of its body as one text."""
     name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, index)
     if name:
         return str(name)

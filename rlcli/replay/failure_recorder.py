@@ -1,13 +1,13 @@
 """Recorder of the last seconds of failed and outlier episodes of a training, for `rlcli autopsy`.
 
 Ring buffers hold the last seconds of all environments: the states at the beginning of each engine call (`StateHistory`
-in `rlcli.sim.divergence_report`), observations, actions and rewards. In each iteration one episode of every kind is
-copied: for each set of terminations the one with the lowest return, the outliers with a low and with a high return, and
-the first that diverged for each cause. The thread that writes the next checkpoint writes them to files. When a training
-resumes, files that are newer than the checkpoint are removed, because their episodes are run again.
+in `rlcli.sim.divergence_report`), observations, actions and rewards. In each iteration, one episode of every kind is
+copied: for each set of terminations the episode with the lowest return, the outliers with the lowest and the highest
+return, and for each cause of divergence the first episode. The copies are written to files with the next checkpoint.
+When a training resumes, files that were written after its checkpoint are removed, because their episodes are run again.
 
-Recording draws no random numbers and writes nothing to the environment, so that the training gives
-the same weights, bit for bit.
+Recording draws no random numbers and writes nothing to the environment, so that a training with recording has the same
+weights, bit for bit, as a training without recording.
 """
 
 import contextlib
@@ -48,12 +48,15 @@ _log = logging.getLogger(__name__)
 RECENT = 1024
 """Number of recent episodes with whose returns a new return is compared."""
 LEAST = 64
-"""Smallest number of recent returns with which a new return can be an outlier."""
+"""Number of recent returns that are needed before a new return can be an outlier."""
 FAR = 3.0
 """Distance from the quartiles, in interquartile ranges, above which a return is an outlier (Tukey's outer fences)."""
 _RETURNS_FILE = "recent.json"
 _MIN_SPREAD = 1e-3
-"""Smallest interquartile range, as a fraction of the quartiles: returns equal in three digits are no outliers."""
+"""Lower limit of the interquartile range, as a fraction of the larger quartile.
+
+Without a limit, nearly equal returns would have outliers that differ only in the fourth digit.
+"""
 
 _Key = tuple[FailureKind, *tuple[str, ...]]
 """Kind of an episode, and the causes of its end: for each key, one episode is kept per iteration."""
@@ -64,12 +67,15 @@ class KeptEpisode:
     """The last steps of a failed or outlier episode, in memory, before they are written to a file."""
 
     value: float
-    """Rank of the episode: the episode with the lowest value of its kind is kept."""
+    """Number by which episodes of one kind are compared, such as the return; the episode with the lowest is kept."""
     kind: FailureKind
     episode: Episode
     trace: CallTrace
+    """The last engine calls of the episode's environment."""
     tensors: dict[str, Tensor]
+    """Observations, actions and rewards of the steps, by their names in a trajectory file (`episode.0.*`)."""
     follows_constants: bool
+    """Whether MuJoCo derives its constants again from the environment's own model fields."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,9 +85,9 @@ class FailureBatch:
     step: int
     """Environment steps of the checkpoint."""
     write: dict[str, tuple[KeptEpisode, Failure]]
-    """File name -> content."""
+    """File name -> content of the files to write."""
     remove: list[str]
-    """Names of files to remove."""
+    """Names of the files to remove after the checkpoint is complete."""
     returns: list[float]
     """Returns of recent episodes, with which a resumed training recognises outliers."""
 
@@ -98,9 +104,9 @@ class FailureRecorder(StepObserver):
     """Observer that records the last steps of failed and outlier episodes of a training on a CPU.
 
     Args:
-        env: the environment; its engine is set to keep the last seconds.
-        config: limits of time, memory and number of files.
-        folder: folder of the run; files go to `autopsy` in it.
+        env: the environments; their engine is set to keep the calls of the last seconds.
+        config: limits of time, memory and number of files (`autopsy:` of the agent).
+        folder: folder of the run; the files are written to its subfolder `autopsy`.
         step: environment steps of the checkpoint from which training resumes; None: a new training.
     """
 
@@ -136,19 +142,19 @@ class FailureRecorder(StepObserver):
 
     @property
     def seconds(self) -> float:
-        """Recorded time before the end of an episode [s]."""
+        """Longest simulated time before the end of an episode that is recorded [s]."""
         return min(self._slots, self._engine.history.calls // self._env.calls_per_step) * self._env.step_dt
 
     def close(self) -> None:
-        """Stop recording."""
+        """Stop recording, and set the engine to keep only its newest call."""
         stop_observing_divergences(self._env, self)
 
     # --- called after iterations and at checkpoints ---
 
     def commit(self, iteration: int, step: int) -> None:
-        """Add the recorded episodes of a finished iteration to those that the next checkpoint writes.
+        """Add the recorded episodes of a finished iteration to the files that the next checkpoint writes.
 
-        `step` is the number of environment steps so far.
+        The training loop calls this method after each iteration. `step` is the number of environment steps so far.
         """
         if self._failed:
             _log.warning("failed episodes are not recorded any more: %s", self._failed)
@@ -166,7 +172,10 @@ class FailureRecorder(StepObserver):
         self._update_quartiles()
 
     def take(self, step: int) -> FailureBatch:
-        """Return the files to write and to remove with the checkpoint at an environment step."""
+        """Return the files to write and to remove with a checkpoint; the next call returns only later files.
+
+        `step` is the number of environment steps of the checkpoint.
+        """
         names = set(self._files)
         batch = FailureBatch(step, self._unwritten, sorted(self._written - names), self._recent.tolist())
         self._unwritten, self._written = {}, names
@@ -175,7 +184,7 @@ class FailureRecorder(StepObserver):
     def write(self, batch: FailureBatch) -> None:
         """Write the files of a batch; a disk error ends the recording, but not the training.
 
-        It runs in the thread that writes the checkpoint.
+        The thread that writes checkpoints calls this method.
         """
         try:
             for name, (kept, failure) in batch.write.items():
@@ -198,7 +207,7 @@ class FailureRecorder(StepObserver):
             self._failed = str(error)
 
     def drop(self, batch: FailureBatch) -> None:
-        """Remove the files that a batch lists, after its checkpoint is complete."""
+        """Remove the files in `batch.remove` from the folder; call it after the checkpoint is complete."""
         for name in batch.remove:
             with contextlib.suppress(MachineError), disk_errors(self._folder / name):
                 (self._folder / name).unlink(missing_ok=True)
@@ -210,9 +219,9 @@ class FailureRecorder(StepObserver):
     # --- called in every step ---
 
     def on_divergence(self, found: list[Divergence], pending: bool) -> None:
-        """Copy the last engine calls of environments that diverged, for the recording of their episode.
+        """Copy the last engine calls of environments that diverged; `on_step` then keeps their episodes.
 
-        Only for the first divergence of each cause.
+        In each iteration only the first divergence of each cause is copied. `pending`: see `trace_calls`.
         """
         for divergence in found:
             if ("diverged", divergence.cause) not in self._pending:
@@ -272,8 +281,8 @@ class FailureRecorder(StepObserver):
 
         Args:
             key: kind of the episode, and the causes of its end.
-            value: rank of each ended episode, as in `KeptEpisode`.
-            mask: whether an ended episode is of this kind.
+            value: `KeptEpisode.value` of each ended episode. (ended,)
+            mask: whether an ended episode is of this kind. (ended,)
             ended: the ended episodes.
         """
         if not mask.any():
@@ -286,14 +295,14 @@ class FailureRecorder(StepObserver):
             self._keep_episode(key, float(value[row]), ended, row, trace)
 
     def _keep_episode(self, key: _Key, value: float, ended: Episodes, row: int, trace: CallTrace) -> None:
-        """Copy the last steps of an ended episode, as many as are in the ring buffers and in the trace.
+        """Copy the last steps of an ended episode, as many as are in both the ring buffers and the trace.
 
         Args:
             key: kind of the episode, and the causes of its end.
-            value: its rank, as in `KeptEpisode`.
+            value: `KeptEpisode.value` of the episode.
             ended: the ended episodes.
             row: the row of the episode in `ended`.
-            trace: its last engine calls.
+            trace: the last engine calls of the episode's environment; older calls are removed from `trace`.
         """
         per_step, env = self._env.calls_per_step, trace.divergence.env
         whole = (len(trace.calls) - trace.last) // per_step
@@ -309,7 +318,7 @@ class FailureRecorder(StepObserver):
         self._pending[key] = KeptEpisode(value, key[0], episode, trace, tensors, self._engine.own_constants)
 
     def _fences(self) -> tuple[float, float]:
-        """Return the lowest and the highest return that is no outlier, from the quartiles of recent returns."""
+        """Return the lowest and the highest return that is no outlier; infinite before there are `LEAST` returns."""
         if self._quartiles is None:
             return -np.inf, np.inf
         first, third = self._quartiles
@@ -326,9 +335,10 @@ class FailureRecorder(StepObserver):
             self._quartiles = (first, third)
 
     def _evict(self) -> None:
-        """Drop files until there are at most `autopsy.keep` of the agent's settings.
+        """Drop files until at most as many are left as the agent's setting `autopsy.keep` allows.
 
-        Each time the oldest file of the most frequent kind is dropped, so that every kind of failure stays.
+        Each time the oldest file of the most frequent kind is dropped, so that every kind of failure stays. The next
+        checkpoint removes the dropped files from the disk.
         """
         self._files = dict(sorted(self._files.items()))  # a resumed run reads the folder in this order
         while len(self._files) > self._keep:
@@ -341,7 +351,10 @@ class FailureRecorder(StepObserver):
     # --- start of the recording ---
 
     def _steps_that_fit(self, seconds: float, memory: int) -> int:
-        """Return the number of environment steps in the ring buffers: as many as fit `seconds` and `memory` [bytes]."""
+        """Return the number of environment steps that the ring buffers hold; at least 1.
+
+        As many as last `seconds` [s], fit into `memory` [bytes] and can be simulated again by a replay.
+        """
         env, engine = self._env, self._engine
         columns = env.layout.size() + env.layout.action_size + 1 + len(env.reward_names)
         bytes_per_step = env.num_envs * (8 * engine.history.width * env.calls_per_step + 4 * columns)
@@ -349,9 +362,10 @@ class FailureRecorder(StepObserver):
         return max(1, min(round(seconds / env.step_dt), most, memory // bytes_per_step))
 
     def _read_folder(self, step: int | None) -> None:
-        """Read the failure cases that the folder has already, and remove those that are newer than the checkpoint.
+        """List the failure cases that the folder already has, and remove those written after the checkpoint.
 
-        `step` is the step of the checkpoint from which training resumes. A file that cannot be read is kept.
+        `step` is the number of environment steps of the checkpoint from which training resumes; None: a new training,
+        which removes all failure cases. A file that cannot be read is kept.
         """
         if not self._folder.is_dir():
             return
@@ -379,7 +393,7 @@ class FailureRecorder(StepObserver):
 def open_failure_recorder(
     env: Environment, config: AutopsyConfig | None, folder: Path, step: int | None
 ) -> FailureRecorder | None:
-    """Return a recorder of failed and outlier episodes; None without a configuration, and on a GPU.
+    """Return a recorder of failed and outlier episodes; None if `config` is None, and on a GPU.
 
     Steps on a GPU cannot be replayed. The arguments are those of `FailureRecorder`.
     """

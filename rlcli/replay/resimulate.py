@@ -1,8 +1,8 @@
-"""Replays of trajectory files: simulate their steps again, and compare every state bit by bit.
+"""Replay trajectory files: simulate their steps again, and compare every state with the file, bit by bit.
 
-A recording is replayed in an environment: its actions are applied to all environments, so that events, rewards and
-resets are computed again. Engine calls of crash dumps and failure files are replayed in one world for each environment,
-without the task's terms.
+The actions of a recording are applied to an environment of the task, which computes events, rewards and resets again.
+The engine calls of crash dumps and failure files are simulated without the task's terms, in one physics simulation for
+each recorded environment.
 """
 
 import contextlib
@@ -27,7 +27,7 @@ from rlcli.sim.divergence_report import WARNING_FIELDS, Call, Divergence
 from rlcli.sim.engine import open_cpu_engine
 
 _PHYSICS_FIELDS = ("time", "qpos", "qvel", "act", "qacc_warmstart")
-"""Fields of a state that only physics and events write between two engine calls."""
+"""Fields of a state that only physics and events write; the others are also written before each engine call."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,12 +36,15 @@ class Difference:
 
     env: int
     episode: int | None
-    """Index of the episode in a recording; None for engine calls."""
+    """Index of the episode in the recording, from 0; None for a crash dump or a failure file."""
     step: int
     """Index of the state in the episode, or of the engine call, from 0."""
     field: str
+    """Name of the field of the state, such as `qpos`, or `reward`."""
     recorded: list[float]
+    """Values of the field in the file."""
     replayed: list[float]
+    """Values of the field in the replay."""
 
 
 @dataclass(slots=True)
@@ -49,14 +52,14 @@ class Replay:
     """Result of a replay: what was simulated again, and the first difference from the file (None: all is equal)."""
 
     steps: int
-    """Environment steps, or engine calls, that were simulated again."""
+    """Number of environment steps of a recording, or engine calls of another file, that were simulated again."""
     difference: Difference | None = None
     compared: int = 0
-    """Number of states that were compared after engine calls."""
+    """Number of engine calls after which the states were compared; 0 for a recording."""
     same_model: bool = True
-    """Whether the installed task's model is the recorded one."""
+    """Whether the model of the installed task equals the recorded model; not checked for a recording."""
     diverged_at: dict[int, DivergencePoint | None] = field(default_factory=dict)
-    """Environment -> the point at which its simulation diverges now."""
+    """Index of a recorded environment -> where its replay diverges; None: the replay does not diverge."""
 
 
 # --- recordings ---
@@ -68,10 +71,10 @@ def choose_episodes(trajectory: Trajectory, episode: int | None, *, filmed: bool
     Args:
         trajectory: the file.
         episode: index of the only episode to replay; None: all.
-        filmed: whether a video of the replay is wanted, which crash dumps and failure files do not allow.
+        filmed: whether a video of the replay will be made, which is possible for recordings only.
 
     Raises:
-        UsageError: if the file does not hold the episode.
+        UsageError: if the file does not have the episode, or is of a kind without complete episodes.
     """
     count = len(trajectory.header.episodes)
     if trajectory.header.kind != "recording":
@@ -81,10 +84,12 @@ def choose_episodes(trajectory: Trajectory, episode: int | None, *, filmed: bool
         return []
     if episode is not None and episode >= count:
         raise UsageError(
-            f"there is no episode {episode} in {trajectory.file}", hint=f"it has {count} episodes, numbered from 0"
+            f"there is no episode {episode} in {trajectory.file}",
+            hint=f"the file has {count} episodes, numbered from 0",
         )
     if not count:
-        raise UsageError(f"{trajectory.file} has no episodes", hint="record with --record-mode all")
+        hint = "no episode was of the recorded kind; record all: rlcli eval TASK --record FILE --record-mode all"
+        raise UsageError(f"{trajectory.file} has no episodes", hint=hint)
     return list(range(count)) if episode is None else [episode]
 
 
@@ -108,13 +113,16 @@ def read_state(env: VecEnv) -> dict[str, Tensor]:
 def replay_episodes(
     recording: Trajectory, env: VecEnv, episodes: Iterable[int], before_step: Callable[[int], None] = lambda step: None
 ) -> Replay:
-    """Apply the actions of a recording again; compare every state and reward of some episodes with the recorded ones.
+    """Apply the actions of a recording again; compare the states and rewards of some episodes with the recorded ones.
 
     Args:
         recording: the recording.
-        env: an environment with the recorded configuration.
+        env: the environments, with the recorded configuration.
         episodes: indices of the episodes to compare, from 0.
-        before_step: called with the index of each step.
+        before_step: called before each environment step with its index in the recording, from 0.
+
+    Returns:
+        The result; it ends at the first difference.
 
     Raises:
         CheckpointError: if the recording does not fit the environment.
@@ -159,13 +167,14 @@ def _same_bits(left: NDArray[np.generic], right: NDArray[np.generic]) -> bool:
 
 
 class ReplayWorld:
-    """Simulation of one environment without its task, to run recorded engine calls again.
+    """Physics simulation of one environment without the task's terms, to simulate recorded engine calls again.
 
     Args:
         model: the model of all environments.
-        resolved: the configuration.
-        own_model: model fields that differ between environments, with this environment's values.
-        follows_constants: whether MuJoCo's constants are derived from these fields again.
+        resolved: the configuration, whose section `sim` is used.
+        own_model: fields of the model that differ between environments, with this environment's values, by name.
+        follows_constants: whether the constants that MuJoCo derives from a model (`mj_setConst`) are derived again from
+            `own_model`.
 
     Raises:
         ValueError, RuntimeError: if the fields do not fit the model.
@@ -187,19 +196,19 @@ class ReplayWorld:
         self.engine, self.layout = engine, engine.state_layout
 
     def simulate(self, call: Call) -> NDArray[np.float64]:
-        """Simulate a recorded engine call from its recorded state, and return the state after it."""
+        """Simulate a recorded engine call from its recorded state, and return the integration state after it."""
         self.engine.set_state_row(0, call.state)
         self.engine.step(call.nstep)
         self.engine.diverged()
         return self.engine.state_row(0)
 
     def differing_field(self, recorded: NDArray[np.float64], now: NDArray[np.float64], *, final: bool) -> str | None:
-        """Return the name of the first field in which two states differ, bit by bit; None if all are equal.
+        """Return the name of the first field in which two states differ in any bit; None if all compared fields agree.
 
         Args:
             recorded: the recorded state.
             now: the state of the replay.
-            final: whether to compare all fields; false: only those that physics alone writes between engine calls.
+            final: whether to compare all fields; false: only `_PHYSICS_FIELDS`.
         """
         for name, columns in self.layout.fields():
             if (final or name in _PHYSICS_FIELDS) and not _same_bits(recorded[columns], now[columns]):
@@ -232,11 +241,11 @@ class ReplayWorld:
         return None
 
     def _diverged_value(self, found: Divergence, before: NDArray[np.float64]) -> tuple[str, str]:
-        """Return what shows a divergence, as two texts: array element, joint or actuator, and its value.
+        """Return `place` and `value` of a `DivergencePoint`: where a divergence shows, and the value there.
 
         Args:
             found: the divergence.
-            before: the state before the physics step that diverged.
+            before: the integration state before the physics step that diverged.
         """
         warned = WARNING_FIELDS.get(found.cause)
         if warned is None:
@@ -259,30 +268,34 @@ class ReplayWorld:
 
 @dataclass(frozen=True, slots=True)
 class StagedWorld:
-    """The recorded engine calls of one environment, with a simulation in which they can be run again."""
+    """The recorded engine calls of one environment, with a physics simulation that can simulate them again."""
 
     header: World
+    """Cause of the recording, and facts about the calls."""
     world: ReplayWorld
+    """The simulation, with the environment's own model fields."""
     calls: list[Call]
+    """The calls, oldest first."""
     final: NDArray[np.float64]
-    """The state after the last call."""
+    """The recorded integration state after the last call. (nstate,)"""
 
 
 @dataclass(frozen=True, slots=True)
 class Staged:
-    """Content of a failure or crash file, and a simulation for each of its environments, from the installed task.
-
-    `same_model` tells whether the installed task's model is the recorded one.
-    """
+    """Content of a failure or crash file, with simulations of the installed task for its recorded environments."""
 
     resolved: Resolved
+    """The recorded configuration, with the installed task's code and models."""
     model: mujoco.MjModel
+    """The compiled model of the installed task."""
     same_model: bool
+    """Whether the installed task's model equals the recorded model."""
     worlds: list[StagedWorld]
+    """One simulation for each recorded environment."""
 
 
 def stage(trajectory: Trajectory, named: TaskSource | None = None) -> Staged:
-    """Build the task of a failure or crash file, and a simulation for each of the recorded environments.
+    """Build the task of a failure or crash file, and a physics simulation for each of the recorded environments.
 
     Args:
         trajectory: the file.
@@ -291,8 +304,8 @@ def stage(trajectory: Trajectory, named: TaskSource | None = None) -> Staged:
 
     Raises:
         TaskError: if the task is not installed any more.
-        ConfigError: if the installed task refuses the configuration.
-        CheckpointError: if the states or model fields do not fit it.
+        ConfigError: if the installed task does not accept the recorded configuration.
+        CheckpointError: if the recorded states or model fields do not fit the installed task's model.
     """
     header, resolved = trajectory.header, trajectory.resolved(named)
     with contextlib.closing(make_env(resolved)) as env:
@@ -323,6 +336,9 @@ def replay_calls(trajectory: Trajectory, named: TaskSource | None = None) -> Rep
     Args:
         trajectory: the file.
         named: the task on the command line, as in `stage`.
+
+    Returns:
+        The result; it ends at the first difference.
 
     Raises:
         CheckpointError, ConfigError, TaskError: see `stage`.

@@ -1,13 +1,13 @@
-"""Trajectory files: recorded steps that `rlcli replay` simulates again and compares bit by bit.
+"""Read and write trajectory files: recorded steps that `rlcli replay` simulates again and compares bit by bit.
 
-A file is in safetensors format with a JSON document under the key `rlcli` of its header; reading it executes nothing.
-There are three kinds of files:
+A file is in safetensors format with a JSON document under the key `rlcli` of its header; reading a file executes no
+code. There are three kinds of files:
 
-- recording: whole episodes of an evaluation. The tensors `start.*` and `actions` hold the state of all environments at
-  the beginning and every action since then, `episode.K.*` the states, actions and rewards of each kept episode.
+- recording: whole episodes of an evaluation. The tensors `start.*` hold the state of all environments at the beginning,
+  `actions` every action since then, `episode.K.*` the states, actions and rewards of episode K.
 - failure: the last steps of one episode of a training. `episode.0.*` holds observations, actions and rewards,
-  `world.0.*` the engine calls.
-- crash: the last engine calls of environments whose simulation diverged, in `world.K.*`.
+  `world.0.*` the engine calls (an engine call simulates one or more physics steps).
+- crash: the last engine calls of environments whose simulation diverged, in `world.K.*` for the K-th environment.
 
 `world.K.states` holds the integration state at the beginning of each engine call, `world.K.final` the state after the
 last one, and `world.K.model.*` the model fields that differ between environments.
@@ -46,9 +46,9 @@ from rlcli.sim.divergence_report import MAX_DESCRIBED
 
 FORMAT = 2
 STATE_FIELDS = ("qpos", "qvel", "act", "ctrl")
-"""Fields of the simulation state that a recording holds for each step."""
+"""Fields of MuJoCo's state that a recording holds for each step."""
 MAX_SUBSTEPS = 300_000
-"""Largest number of physics steps that a replay of engine calls simulates."""
+"""Largest number of physics steps in a failure or crash file."""
 _MAX_BYTES = 2**28
 """Size limit of failure and crash files; a recording has none."""
 
@@ -70,14 +70,14 @@ class Columns(_Strict):
 
 
 class Episode(_Strict):
-    """One recorded episode."""
+    """Facts about one recorded episode: its environment, length, return and end."""
 
     env: Count
     """Index of the environment."""
     index: Count
     """Index of the episode in its environment, from 0."""
     begin: Count
-    """Number of steps in the recording before the episode; 0 in a failure file."""
+    """Index of the first step of the episode in the recording, from 0; 0 in a failure file."""
     length: int = Field(ge=1, le=2**53)
     """Length in environment steps."""
     kept: int = Field(ge=1, le=2**53)
@@ -87,20 +87,20 @@ class Episode(_Strict):
     truncated: bool
     """Whether the episode ended only because of its time limit."""
     success: bool | None
-    """Whether the episode met the task's conditions of success; None if the task has none."""
+    """Whether the episode met the task's success conditions; None if the task has none."""
     causes: list[str]
-    """Terminations that fired in the last step."""
+    """Names of the terminations that ended the episode."""
 
     @staticmethod
     def of(env: Environment, ended: Episodes, row: int, begin: int = 0, kept: int | None = None) -> Episode:
-        """Return an episode that ends in the current step, before the environment is reset.
+        """Return the facts about an episode that ends in the current step; call it before the environment is reset.
 
         Args:
             env: the environments.
             ended: the episodes that end in this step.
             row: the row of the episode in `ended`.
-            begin: number of steps in the recording before the episode.
-            kept: number of its steps in the file; None: all.
+            begin: index of the first step of the episode in the recording, from 0.
+            kept: number of steps of the episode in the file; None: all.
         """
         number, length = int(ended.ids[row]), int(ended.lengths[row])
         return Episode(
@@ -117,7 +117,7 @@ class Episode(_Strict):
 
     @property
     def succeeded(self) -> bool:
-        """Whether the episode is a success. In a task without success condition: whether it ended by a time-out."""
+        """Whether the episode met the success conditions; in a task without them, whether it ended by a time-out."""
         return self.truncated if self.success is None else self.success
 
 
@@ -125,20 +125,20 @@ class DivergencePoint(_Strict):
     """The physics step in which a simulation diverged, and the value that showed it."""
 
     call: Count
-    """Index of the engine call in the file."""
+    """Index of the engine call in the file, from 0."""
     substep: Count
-    """Physics step of that call, counted from 0."""
+    """Index of the physics step in that call, from 0."""
     time: float
     """Simulated time at the beginning of the physics step [s]."""
     cause: str
-    """See `rlcli.sim.divergence_report.Divergence`."""
+    """The cause, such as MuJoCo's warning `BADQACC` or `qpos not finite`."""
     place: str
     """The joint, actuator or array element whose value shows the divergence."""
     value: str
-    """Value of that joint, actuator or element as text, such as `nan` or `1e+30`."""
+    """The value as text: `nan` for an array element, `qacc 1e+30` for a joint or actuator; empty if not known."""
 
     def __str__(self) -> str:
-        """Return the cause, time and value on one line."""
+        """Return cause, physics step, time, place and value on one line."""
         what = f"{self.place} = {self.value}" if self.value else self.place
         return f"{self.cause} in physics step {self.substep} of call {self.call}, t = {self.time:.6g} s: {what}"
 
@@ -147,20 +147,20 @@ class World(_Strict):
     """The engine calls of one environment that a failure or crash file holds."""
 
     env: Count
-    """Environment of the run."""
+    """Index of the environment in the training or evaluation."""
     cause: str
     """Cause of the divergence, or why the episode was kept."""
     detail: str
     """The joint, actuator or element that diverged, if the engine reports it."""
     nstep: list[Annotated[int, Field(ge=1, le=1000)]] = Field(min_length=1, max_length=MAX_SUBSTEPS)
-    """Physics steps of each engine call."""
+    """Number of physics steps of each engine call."""
     follows: list[bool]
-    """For each call but the first: whether it started from the final state of the previous call, apart from controls
-    and forces. False if an event changed the state in between."""
+    """For each call except the first: whether the call started from the state after the previous call, apart from
+    controls and forces. False if an event changed the state in between."""
     first: Count
-    """Index of the first call of the last environment step."""
+    """Index of the first call of the last environment step, from 0."""
     diverged_at: DivergencePoint | None
-    """Where the simulation diverged; None if it did not, or if one world alone does not reproduce the divergence."""
+    """Where the simulation diverged; None if it did not diverge, or if simulating the calls again does not show it."""
 
     @property
     def ended_by(self) -> str:
@@ -172,12 +172,13 @@ class Failure(_Strict):
     """Why and when a training recorded the end of an episode."""
 
     kind: FailureKind
+    """The simulation diverged, the return was an outlier (low or high), or a termination ended the episode."""
     iteration: Count
     """Iteration of the run in which the episode ended."""
     step: Count
-    """Environment steps of the run after that iteration."""
+    """Number of environment steps of the run at the end of that iteration."""
     usual_returns: tuple[float, float] | None
-    """Quartiles of the returns of earlier episodes; None if there were too few."""
+    """First and third quartile of the returns of earlier episodes; None if there were too few episodes."""
 
 
 class Header(_Strict):
@@ -186,25 +187,36 @@ class Header(_Strict):
     format: int
     kind: Kind
     rlcli: str
+    """Version of rlcli."""
     mujoco: str
+    """Version of MuJoCo."""
     task: dict[str, str | None]
+    """By what the task is found again: its name, and its folder or its package."""
     config: str
+    """The resolved configuration, as YAML."""
     model: str
     """SHA-256 of the compiled model's numbers."""
     device: str
+    """The device on which the steps were simulated, such as `cpu`."""
     num_envs: Count
     step_dt: float = Field(gt=0, le=1e6)
-    """Control period [s]."""
+    """Simulated time of an environment step [s]."""
     follows_constants: bool
     """Whether MuJoCo's constants were derived again from model fields that differ between environments."""
     columns: Columns
     episodes: list[Episode]
+    """Episodes of the file; empty in a crash file."""
     worlds: list[World] = Field(max_length=MAX_DESCRIBED)
+    """Environments with recorded engine calls; empty in a recording."""
     failure: Failure | None
+    """Why a training recorded the episode; only in a failure file."""
 
     @staticmethod
     def of(env: Environment) -> Header:
-        """Return the header of a recording that has no episodes yet, with the task and configuration of `env`."""
+        """Return the header of a recording without episodes, with the task and configuration of `env`.
+
+        Callers replace `kind`, `episodes` and other values by `model_copy`.
+        """
         columns = Columns(
             observations=_column_names(env.layout.observations["policy"]),
             actions=_column_names(env.layout.actions),
@@ -235,12 +247,12 @@ class Header(_Strict):
         if not task.get("name") or not all(name.isprintable() for name in names):
             raise ValueError("task: the name is missing, or a text has unprintable characters; the file is damaged")
         if not (task.get("folder") or task.get("distribution")):
-            raise ValueError("task: folder or distribution is missing; the file is damaged")
+            raise ValueError("task: neither a folder nor a distribution (package) is given; the file is damaged")
         return task
 
     @model_validator(mode="after")
     def _check_parts(self) -> Header:
-        """Check that the parts fit each other and the kind of the file."""
+        """Check that the numbers of steps, calls and episodes fit each other and the kind of the file."""
         for world in self.worlds:
             if len(world.follows) != len(world.nstep) - 1 or world.first >= len(world.nstep):
                 raise ValueError(f"the file is damaged: the engine calls of environment {world.env} do not match")
@@ -284,15 +296,16 @@ class Trajectory:
     def resolved(self, named: TaskSource | None = None) -> Resolved:
         """Return the recorded configuration with the task's installed code and models.
 
-        A failure or crash file gets one environment, in which the calls of each recorded environment are simulated.
+        For a failure or crash file, `scene.num_envs` is 1, because each recorded environment is simulated on its own.
 
         Args:
             named: the task on the command line; it replaces the recorded task if both are local files or folders.
 
         Raises:
             TaskError: if the task is not installed any more.
-            CheckpointError: if the task is code that the user has never named on this machine.
-            ConfigError: if the installed task refuses the configuration.
+            CheckpointError: if the user has never named the task's code on this machine, so that it is not trusted; or
+                if header and configuration do not agree.
+            ConfigError: if the installed task does not accept the recorded configuration.
         """
         source = recorded_task(self.header.task, f"the task of {self.file}", named=named)
         with tempfile.TemporaryDirectory() as folder:
@@ -306,7 +319,7 @@ class Trajectory:
         return resolved
 
     def mismatch_error(self, error: Exception) -> CheckpointError:
-        """Return the error for a file whose states do not fit the installed task; `error` is the exception with why."""
+        """Return the error for a file whose states do not fit the installed task; `error` is the exception raised."""
         message = f"{self.file} does not fit the installed task: {' '.join(str(error).split())}"
         words = ", ".join(f"{key} {value}" for key, value in self.header.task.items() if value is not None)
         return CheckpointError(message, hint=f"install the version of the task that made the file: {words}")
@@ -319,8 +332,8 @@ def write_trajectory(file: Path, header: Header, tensors: Mapping[str, Tensor], 
         file: the file to write.
         header: the JSON document of the file.
         tensors: name -> tensor, with the names that the module's docstring lists.
-        parents: whether the folders above are created, too. In a run they are not: a run that was moved away during
-            its training must not be created again.
+        parents: whether missing folders above the file's folder are created, too. In a run they are not: a run that
+            was moved away during its training must not be created again.
 
     Raises:
         MachineError: if the disk reports an error.
@@ -339,7 +352,7 @@ def read_trajectory(file: Path) -> Trajectory:
     """Read and check a trajectory file.
 
     Raises:
-        CheckpointError: if the file is missing, corrupt or of another format.
+        CheckpointError: if the file is missing, corrupt, too large or of another format.
     """
     try:
         if file.exists() and not file.is_file():
@@ -383,7 +396,7 @@ def _check_tensors(header: Header, tensors: Mapping[str, Tensor]) -> None:
     """Check the shapes and types of the tensors that a replay reads.
 
     Raises:
-        ValueError: with the first one that does not fit.
+        ValueError: if a tensor is missing, or has another shape or type than the header says.
     """
     shapes: dict[str, tuple[int | None, ...]] = {}
     if header.kind == "recording":
@@ -416,7 +429,7 @@ def _check_tensors(header: Header, tensors: Mapping[str, Tensor]) -> None:
 
 
 def _column_names(terms: tuple[TermLayout, ...]) -> list[str]:
-    """Return a name for each column: `joint_pos.hip`, `last_action[2]`, or the name of a term with one column."""
+    """Return a name for each column: `joint_pos.hip`, `last_action[2]`, or the term's name if it has one column."""
     names = []
     for term in terms:
         for index in range(term.size):

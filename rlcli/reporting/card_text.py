@@ -1,6 +1,6 @@
 """Short texts for values of a task's configuration, such as noise and ranges, in the tables of a task card.
 
-A task card describes a task's Markov decision process, see `rlcli.reporting.task_card`.
+A task card describes the observations, actions, rewards and other parts of a task (`rlcli.reporting.task_card`).
 """
 
 from collections.abc import Mapping
@@ -22,7 +22,7 @@ def columns_text(count: int) -> str:
 
 
 def text_of(value: object) -> str:
-    """Return a value of a configuration as text: `yes`, `0.5`, `[1, 2]`, `key: value`."""
+    """Return a value of a configuration as text: `yes`, `0.5`, `[1, 2]`, `key: value`; `-` for None."""
     if isinstance(value, bool) or value is None:
         return {True: "yes", False: "no", None: "-"}[value]
     if isinstance(value, int | float):
@@ -37,7 +37,10 @@ def text_of(value: object) -> str:
 
 
 def noise_text(config: UniformNoiseConfig | GaussianNoiseConfig | ConstantNoiseConfig | None) -> str:
-    """Return the operation and the distribution of a noise model as text, such as `+ uniform [-0.1, 0.1]`."""
+    """Return the operation and the distribution of a noise model as text, such as `+ uniform [-0.1, 0.1]`.
+
+    The text is empty if there is no noise model (None).
+    """
     if config is None:
         return ""
     verb = {"add": "+", "scale": "x", "set": "="}[config.operation]
@@ -49,7 +52,7 @@ def noise_text(config: UniformNoiseConfig | GaussianNoiseConfig | ConstantNoiseC
 
 
 def modifier_text(settings: Mapping[str, Any]) -> str:
-    """Return the kind and the settings of an observation modifier (such as a filter) as text."""
+    """Return the kind and the settings of an observation modifier as text, such as `digital filter a: [0.9], ...`."""
     rest = {key: value for key, value in settings.items() if key != "kind"}
     return f"{settings['kind'].replace('_', ' ')} {text_of(rest)}".strip()
 

@@ -1,6 +1,6 @@
-"""Choice of the panels in a picture of learning curves: one panel for each metric, and one for all terminations.
+"""Choose the panels of a picture of learning curves: the metrics of each panel, its title, and its lines or bands.
 
-`rlcli plot` and the report of a run draw these panels.
+`rlcli plot` and the HTML report of a run plot these panels.
 """
 
 import difflib
@@ -12,9 +12,9 @@ from rlcli.reporting.curves import Curve, Line
 
 REWARDS, TERMINATIONS = "Episode_Reward/", "Episode_Termination/"
 METRICS = {"return": "Train/mean_reward", "success": "Train/success_rate", "length": "Train/mean_episode_length"}
-"""Name of a metric for --metrics -> its name in metrics.jsonl."""
+"""Short name of a metric, for the option `--metrics` of `rlcli plot` -> its name in the run's metrics.jsonl."""
 GROUPS = {"rewards": REWARDS, "terminations": TERMINATIONS}
-"""Name of a group of metrics for --metrics -> prefix of their names in metrics.jsonl."""
+"""Name of a group of metrics, for `--metrics` -> the prefix of the names of these metrics in metrics.jsonl."""
 DEFAULT = (*METRICS, *GROUPS)
 
 _EVALUATED = "Eval/success_rate"
@@ -31,7 +31,10 @@ _SHARES = ("success_rate",)
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """Line or stacked band in a panel, such as one run's return; `index` selects its colour and line style."""
+    """Line or stacked band in a panel, such as the return of one run.
+
+    `label` is its text in the legend; `index` selects its colour and line style.
+    """
 
     label: str
     line: Line
@@ -44,27 +47,32 @@ class Panel:
 
     title: str
     unit: str
+    """Label of the y axis."""
     items: list[Item]
     stacked: bool = False
     """Whether the items are bands stacked from 0 to 1."""
     share: bool = False
     """Whether the y axis is a share from 0 to 1."""
     by_curve: bool = False
-    """Whether there is one line for each `Curve` of the picture. All such panels share one legend."""
+    """Whether the panel has one line for each `Curve` of the picture. All such panels share one legend."""
     subtitle: str = ""
+    """Label of the curve that the panel belongs to; empty if it belongs to all."""
 
 
 def choose(curves: Sequence[Curve], names: Sequence[str] | None = None, axis: str = "steps") -> list[Panel]:
-    """Return the panels of a picture of learning curves: one for each metric, and one for all reward terms of a curve.
+    """Return the panels of a picture of learning curves.
+
+    A metric has one panel with a line for each curve. `terminations` has a panel for each curve. `rewards` has one
+    panel for all reward terms if there is one curve, else one for each reward term. Empty panels are left out.
 
     Args:
         curves: the curves, each of one run or of runs that differ only in their seed.
         names: keys of `METRICS` or `GROUPS`, or names in metrics.jsonl, or the part of these names before the slash;
             None: those of `METRICS` and `GROUPS` that the runs have.
-        axis: the x axis, a key of `AXES`.
+        axis: the x axis, a key of `rlcli.reporting.curves.AXES`.
 
     Raises:
-        UsageError: for a name that no run has, with the list of valid names.
+        UsageError: for a metric that no run has, with the list of valid names.
     """
     known = list(dict.fromkeys(name for curve in curves for name in curve.names()))
     panels: list[Panel] = []
@@ -98,7 +106,8 @@ def _unknown(name: str, known: Sequence[str]) -> UsageError:
     tails = {each.rpartition("/")[2]: each for each in reversed(names)}
     tail = next(iter(difflib.get_close_matches(name, list(tails), n=1)), None)
     near = did_you_mean(name, names) or (f"did you mean '{tails[tail]}'?" if tail else None)
-    return UsageError(f"no metric '{name}'", hint=f"{near} " * bool(near) + f"metrics: {listing(names, 60)}")
+    message = f"no metric '{name}' in metrics.jsonl of the runs"
+    return UsageError(message, hint=f"{near} " * bool(near) + f"metrics: {listing(names, 60)}")
 
 
 def _panel(curves: Sequence[Curve], metric: str, axis: str) -> Panel:
@@ -115,7 +124,7 @@ def _panel(curves: Sequence[Curve], metric: str, axis: str) -> Panel:
 def _stacks(curves: Sequence[Curve], metrics: Sequence[str], axis: str) -> list[Panel]:
     """Return a panel for each curve with stacked bands: the share of episodes that each termination ended.
 
-    Over several seeds the bands are means, because the shares of all terminations must add up to 1.
+    A band of several seeds is their mean, not their interquartile mean, so that the shares still add up to 1.
     """
     panels = []
     for curve in curves:
@@ -126,8 +135,8 @@ def _stacks(curves: Sequence[Curve], metrics: Sequence[str], axis: str) -> list[
 
 
 def _items(lines: Iterable[tuple[str, Line | None]]) -> list[Item]:
-    """Return an item for each line that is not None; its position in `lines` sets its colour.
+    """Return an item for each line that is not None; the position of a line in `lines` sets the item's colour.
 
-    So a curve has the same colour in every panel, also in a picture where some panels lack a curve.
+    So a curve has the same colour in every panel, even if some panels lack other curves.
     """
     return [Item(label, line, index) for index, (label, line) in enumerate(lines) if line is not None]

@@ -1,4 +1,4 @@
-"""Learning curves of runs; runs that differ only in their seed share one curve.
+"""Read the metrics of runs, and compute learning curves; runs that differ only in their seed share one curve.
 
 A curve of several seeds is their interquartile mean with a 95 % interval from a stratified percentile bootstrap, as
 Agarwal et al. recommend (Deep Reinforcement Learning at the Edge of the Statistical Precipice, NeurIPS 2021,
@@ -38,14 +38,14 @@ _LEVEL = 95.0
 _TRIM = 0.25
 """Fraction of the values that the interquartile mean leaves out at each end."""
 FEWEST_FOR_IQM = 4
-"""Smallest number of runs for which the interquartile mean leaves values out; for fewer runs it is the mean."""
+"""Smallest number of runs for which the interquartile mean leaves values out; of fewer runs the mean is taken."""
 _MAX_POINTS = 1000
 """Largest number of points of a curve over several runs."""
 _MAX_METRICS = 1000
 _NAMED = re.compile(r"\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d-((?!\d+$).+)")
 """Folder name of a run with a `--name`; group 1 is that name."""
 _MAX_DIFFERENCES = 3
-"""Largest number of settings in the label of a curve."""
+"""Largest number of settings that the label of a curve shows to distinguish it from other curves."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,16 +61,19 @@ class History:
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """Metric over an x axis, ready to plot: its values, and the ends of their 95 % interval."""
+    """Metric over an x axis, ready to plot: its values at p points, and the ends of their 95 % interval."""
 
     x: Array
+    """Values of the x axis, ascending. (p,)"""
     middle: Array
+    """Values of the metric, for several runs their mean. (p,)"""
     low: Array | None = None
-    """Lower end of the 95 % interval; None for a single run."""
+    """Lower end of the 95 % interval; None without an interval, as for a single run. (p,)"""
     high: Array | None = None
+    """Upper end of the 95 % interval; None without an interval. (p,)"""
 
     def last(self) -> tuple[float | None, ...]:
-        """Return the last x, the last value, and both ends of its interval (None, None for a single run)."""
+        """Return the last x, the last value, and both ends of its interval (None, None without an interval)."""
         return tuple(None if end is None else float(end[-1]) for end in (self.x, self.middle, self.low, self.high))
 
 
@@ -97,6 +100,10 @@ class Curve:
         """Return a metric over an x axis; for several runs, their interquartile mean with its 95 % interval.
 
         Return None if a run does not have the metric, or if the runs have no common range of the axis.
+
+        Args:
+            metric: name of the metric in metrics.jsonl.
+            axis: name of the x axis, a key of `AXES`.
         """
         aligned = self._aligned(metric, axis)
         if aligned is None:
@@ -128,10 +135,13 @@ class Curve:
 
 
 def read_history(run: Run) -> History:
-    """Read the metrics of a run up to the first corrupt line; a killed process may leave an incomplete last line.
+    """Read the metrics of a run up to the first corrupt line.
+
+    An incomplete last line, as a killed process leaves one, is skipped. Rows from the first one on whose iteration or
+    step does not increase are left out, with a warning.
 
     Raises:
-        CheckpointError: if the run has no metrics yet, or they cannot be read.
+        CheckpointError: if the run has no metrics yet, or the file metrics.jsonl cannot be read.
     """
     columns: dict[str, array[float]] = {}
     axes: dict[str, array[float]] = {name: array("d") for name in AXES}
@@ -140,7 +150,7 @@ def read_history(run: Run) -> History:
         current = (row["iteration"], row["step"])
         if not all(before < now < 2**62 for before, now in zip(last, current, strict=True)):
             what = f"iteration {current[0]}, step {current[1]} after iteration {last[0]}, step {last[1]}"
-            _log.warning("%s: %s: the rows from there on are left out", run.metrics, what)
+            _log.warning("%s: %s: numbers must increase; the rows from there on are left out", run.metrics, what)
             break
         last = current
         numbers = {name: float(value) for name, value in row.items()}
@@ -166,9 +176,11 @@ def read_history(run: Run) -> History:
 def gather(runs: Sequence[Run]) -> tuple[list[Curve], list[str]]:
     """Return the curves of runs, in the order of the runs. Runs that differ only in their seed become one curve.
 
+    Runs that cannot be read are left out; of runs that are equal even in their seed, all but the newest.
+
     Returns:
-        The curves, and notes for the user: a sentence for each run that is left out, and for each curve that ends
-        early, at the last step of its shortest run.
+        The curves, and notes for the user: a sentence for each run that is left out, and for each curve whose runs have
+        different lengths, and which therefore ends at the last step of the shortest one.
 
     Raises:
         CheckpointError: if no run has readable metrics and a readable configuration.
@@ -190,7 +202,7 @@ def gather(runs: Sequence[Run]) -> tuple[list[Curve], list[str]]:
             continue
         newer, older = sorted((history, twin), key=lambda each: str(each.run.record.get("started", "")), reverse=True)
         group.histories[group.histories.index(twin)] = newer
-        notes.append(f"{older.run.folder} is left out: {newer.run.folder} has the same seed and is newer")
+        notes.append(f"{older.run.folder} is left out: {newer.run.folder} has the same settings and seed, and is newer")
     if not groups:
         first = notes[0].removeprefix("left out: ")
         raise CheckpointError(f"none of the {len(runs)} runs can be plotted; the first: {first}")
@@ -209,7 +221,8 @@ def gather(runs: Sequence[Run]) -> tuple[list[Curve], list[str]]:
 def iqm(values: Array) -> Array:
     """Return the interquartile mean over n runs. (n, p) -> (p,)
 
-    The lowest and the highest quarter of the runs (rounded down) are left out; with fewer than four runs none is.
+    At each point, the lowest and the highest quarter of the n values (rounded down) are left out; of fewer than four
+    values none is left out.
     """
     count = len(values)
     cut = int(_TRIM * count)
@@ -281,7 +294,7 @@ def _settings(run: Run) -> dict[str, Any]:
 
 
 def _labels(groups: Sequence[Curve]) -> list[str]:
-    """Return a label for each group of runs, which distinguishes it from the other groups.
+    """Return a label for each curve, which distinguishes its group of runs from the other groups.
 
     The label is the group's `--name`, or task, agent and settings as far as these differ between the groups. Settings
     are compared only between groups of the same task, an agent's settings only between groups of the same agent.
@@ -320,7 +333,10 @@ def _labels(groups: Sequence[Curve]) -> list[str]:
 
 
 def _chosen_name(group: Curve) -> str:
-    """Return the `--name` of a group's runs, from the end of their folders' names; the empty text without one."""
+    """Return the `--name` with which a group's runs were trained; an empty text if they have none, or different ones.
+
+    The name is the end of the name of a run's folder, or of the folder of its study.
+    """
     folders = (history.run.folder for history in group.histories)
     homes = (folder.parent if (folder.parent / STUDY).is_file() else folder for folder in folders)
     names = {match[1] if (match := _NAMED.fullmatch(home.name)) else "" for home in homes}

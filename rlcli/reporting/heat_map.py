@@ -1,6 +1,6 @@
-"""Heat map of `rlcli stress`: a metric of the policy for each pair of values of two varied parameters.
+"""Heat maps of `rlcli stress`: a metric of the policy for each pair of values of two varied parameters.
 
-The colours of all maps of a stress test have the same scale.
+All heat maps of a stress test, one for each policy, have the same color scale.
 """
 
 import io
@@ -39,13 +39,14 @@ class HeatMap:
     rows: Axis
     columns: Axis
     cells: tuple[tuple[float, ...], ...]
+    """Values of the metric: one tuple for each row, with one value for each column."""
     low: float
     """Value at the lower end of the colour scale."""
     high: float
     """Value at the upper end of the colour scale."""
 
     def share(self, value: float) -> float:
-        """Return the position of a value on the colour scale, from 0 to 1."""
+        """Return the position of a value on the colour scale, from 0 (`low`) to 1 (`high`)."""
         return 1.0 if self.high <= self.low else min(1.0, max(0.0, (value - self.low) / (self.high - self.low)))
 
 

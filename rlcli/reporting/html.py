@@ -1,6 +1,6 @@
-"""Renderer of the HTML page of `rlcli report`: one file without scripts or external resources, with escaped text.
+"""Render the HTML page of `rlcli report`: one file without scripts or external resources.
 
-The content comes from `rlcli.reporting.run_page_content`.
+The content comes from `rlcli.reporting.run_page_content`; all of its text is escaped.
 """
 
 import base64
@@ -29,7 +29,7 @@ _NOT_SHOWN = re.compile(f"{UNSAFE.pattern}|[\ufffe\uffff]")
 
 
 def render(page: Page) -> str:
-    """Return the page as HTML."""
+    """Return the report of a run as HTML, with the video embedded."""
     video = None if page.video is None else f"data:video/mp4;base64,{base64.b64encode(page.video).decode()}"
     template = templates().get_template("page.html.jinja")
     return template.render(page=page, policy=CONTENT_SECURITY_POLICY, video=video, version=__version__)
@@ -62,7 +62,7 @@ def _clean(value: object) -> Any:
 
 
 def _coded(text: str) -> Markup:
-    """Return escaped text in which `names` between backticks are code elements."""
+    """Return escaped text in which names between backticks are `<code>` elements."""
     parts = _clean(text).split("`")
     if len(parts) % 2 == 0:
         return escape(_clean(text))

@@ -1,6 +1,6 @@
-"""Plots of learning curves and of the trials of a sweep with matplotlib, without a window.
+"""Plot learning curves and the trials of a sweep with matplotlib, as the bytes of picture files.
 
-Equal curves give equal bytes, so that files can be compared.
+Equal curves give equal bytes, so that files can be compared. No window is opened.
 """
 
 import importlib.util
@@ -41,13 +41,13 @@ _MAX_LABEL = 64
 _MAX_LINES = 3
 """Largest number of lines of a label in a legend."""
 _NOT_DRAWN = re.compile(f"{UNSAFE.pattern}|[\t\n\ufffe\uffff]")
-"""Characters that a picture cannot show, and characters that change the direction of text."""
+"""Characters that a picture cannot show, and characters that change the direction of text; `?` replaces them."""
 
 _STYLE = Path(__file__).resolve().parent.parent / "templates" / "report" / "curves.mplstyle"
 
 
 def check_drawing() -> None:
-    """Check that pictures can be plotted.
+    """Check that matplotlib is installed, without importing it.
 
     Raises:
         DependencyError: if matplotlib is not installed.
@@ -57,14 +57,17 @@ def check_drawing() -> None:
 
 
 def picture(panels: Sequence[Panel], x_label: str, kind: str, *, title: str = "", note: str = "") -> bytes:
-    """Return a picture of all panels (one metric each) as the content of a file.
+    """Return a picture of several panels as the content of a file.
 
     Args:
         panels: the panels.
-        x_label: label of their x axes.
+        x_label: label of the x axis of each panel.
         kind: file format, one of `FORMATS`.
         title: text above the panels.
         note: text below the panels.
+
+    Raises:
+        DependencyError: if matplotlib is not installed.
     """
     columns = 1 if len(panels) == 1 else 2 if len(panels) <= 4 else 3
     rows = math.ceil(len(panels) / columns)
@@ -86,10 +89,10 @@ def picture(panels: Sequence[Panel], x_label: str, kind: str, *, title: str = ""
 def scatter(
     columns: Sequence[tuple[str, Sequence[Any], bool]], values: Sequence[float], label: str, *, title: str
 ) -> bytes:
-    """Return scatter plots of the results of a sweep's trials over each of the varied settings, as SVG.
+    """Return a scatter plot for each varied setting of a sweep, with the results of the trials, as SVG.
 
     Args:
-        columns: (name, value of each trial, whether the axis is logarithmic) of each setting; values that are not
+        columns: (name, value of each trial, whether the x axis is logarithmic) of each setting; values that are not
             numbers are plotted at equal distances.
         values: the result of each trial.
         label: name of the result.
@@ -121,8 +124,8 @@ def panel_svg(panel: Panel, x_label: str, name: str) -> str:
 
     Args:
         panel: the panel.
-        x_label: label of its x axis.
-        name: prefix of its ids, unique in the page.
+        x_label: label of the x axis.
+        name: prefix of the ids in the SVG element, unique in the page.
     """
     with _drawing({"svg.fonttype": "none"}):
         figure = _figure(_PAGE_SIZE)
@@ -132,7 +135,10 @@ def panel_svg(panel: Panel, x_label: str, name: str) -> str:
 
 
 def legend_of(panel: Panel) -> list[tuple[str, int, int]]:
-    """Return the legend of a panel for an HTML page: (label, index of the colour, index of the line style)."""
+    """Return the legend of a panel for an HTML page: label, index of the colour, index of the line style.
+
+    The legend of a single line is empty.
+    """
     if panel.by_curve and len(panel.items) == 1:
         return []
     return [(item.label, *_look(item)) for item in panel.items]
@@ -211,7 +217,7 @@ def _legend(owner: Any, items: Sequence[Item], *, bands: bool = False, **setting
 
 
 def _legend_text(label: str) -> str:
-    """Return a label for a legend, on up to three lines: the differences of two runs may be at the end."""
+    """Return a label for a legend, on up to three lines: labels of two runs may differ only at the end."""
     text = textwrap.fill(_text(label, _MAX_LINES * _MAX_LABEL), _MAX_LABEL, max_lines=_MAX_LINES, placeholder=" …")
     return f" {text}" if text.startswith("_") else text  # matplotlib leaves out labels that begin with an underscore
 
@@ -253,7 +259,10 @@ def _text(text: str, limit: int = _MAX_LABEL) -> str:
 
 
 def _for_page(svg: str, name: str, label: str) -> str:
-    """Convert matplotlib's SVG for an HTML page: no fixed size, ids that begin with `name`, the page's colours."""
+    """Convert matplotlib's SVG for an HTML page: no fixed size, ids that begin with `name`, the page's colours.
+
+    `label` describes the picture to a screen reader.
+    """
     head, _, rest = svg[svg.index("<svg") :].partition(">")
     view_box = re.search(r'viewBox="[\d. ]+"', head)
     assert view_box is not None

@@ -1,6 +1,6 @@
-"""Evaluation and video for the HTML report of a run.
+"""Add an evaluation and a video to the HTML report of a run.
 
-Both are read from the run's folder; if they are missing, the policy is evaluated and filmed now.
+Both are read from the run's folder; if they are missing there, the policy is evaluated and a video is recorded.
 """
 
 import logging
@@ -21,17 +21,19 @@ _EPISODES = 200
 _MAX_VIDEO_S = 20.0
 """Largest length of a video that is made for a report [s]."""
 _MAX_VIDEO_BYTES = 24 * 2**20
-"""Largest video that a report contains."""
+"""Size limit of the video in a report [bytes]."""
 
 
 class PageMedia:
-    """Evaluation and video of a checkpoint, which are added to a report. The environment is built when it is needed.
+    """Reader, or maker, of the evaluation and the video of a checkpoint, which are added to a report.
+
+    The environment is built only if one of them is missing in the run.
 
     Args:
         page: the report to which evaluation and video are added.
         run: the run.
         checkpoint: the checkpoint's folder.
-        schema: schema version of the command line's JSON documents.
+        schema: version of the command line's JSON documents, for an evaluation that is saved in the run.
     """
 
     def __init__(self, page: Page, run: Run, checkpoint: Path, schema: int) -> None:
@@ -39,7 +41,12 @@ class PageMedia:
         self._name = checkpoint.resolve().name
 
     def add_evaluation(self, *, may_evaluate: bool) -> str:
-        """Add an evaluation to the page: a saved one of the run if there is one, else a new one; return its origin.
+        """Add the run's saved evaluation to the page, or evaluate the policy and save the result in the run.
+
+        An error becomes the reason on the page why there is no evaluation.
+
+        Args:
+            may_evaluate: whether the policy is evaluated if the run has no saved evaluation.
 
         Returns:
             `stored` (saved in the run); `made` (evaluated now); an empty text if there is no evaluation.
@@ -63,10 +70,12 @@ class PageMedia:
         return "made"
 
     def add_video(self) -> str:
-        """Add a video to the page: a saved one of the run if there is one, else a new one; return its origin.
+        """Add the run's saved video of the checkpoint to the page, or record one and save it in the run.
+
+        If neither is possible, the newest saved video of another checkpoint is added.
 
         Returns:
-            `stored` (saved in the run); `made` (recorded now); `older` (saved, of an older checkpoint); an empty text
+            `stored` (saved in the run); `made` (recorded now); `older` (saved, of another checkpoint); an empty text
             if there is no video.
         """
         page, file = self._page, self._run.folder / "videos" / f"{self._name}.mp4"
@@ -123,5 +132,5 @@ class PageMedia:
         except FileNotFoundError:
             return None
         if data[4:8] != b"ftyp":
-            raise CheckpointError(f"{file} is not an MP4 video; move it out of the run")
+            raise CheckpointError(f"{file} is not an MP4 video; move the file out of the run's folder")
         return data

@@ -1,6 +1,6 @@
-"""Content of the HTML page of `rlcli report`, read from the files of a run.
+"""Read the content of the HTML page of `rlcli report` from the files of a run.
 
-A part that cannot be read is left out, with a reason on the page.
+If a part cannot be read, the page has the reason in its place.
 """
 
 import contextlib
@@ -38,7 +38,7 @@ _MAX_CHARACTERS = 2000
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """Value of a run's configuration, and where it was set: file and line, flag or override."""
+    """Value of a run's configuration, and where the value was set: file and line, flag or override."""
 
     key: str
     value: str
@@ -56,26 +56,34 @@ class Chart:
 
 @dataclass(slots=True)
 class Page:
-    """Content of a run's page. If a part is missing, `missing` has the reason."""
+    """Content of the HTML page of a run. If a part is missing, `missing` has the reason."""
 
     task: str
+    """Name of the task."""
     name: str
+    """Name of the run's folder."""
     summary: str
+    """One line on what the policy does."""
     facts: list[tuple[str, str]]
+    """Facts about the training, such as its seed: (name, value)."""
     card: Card | None = None
+    """Tables that describe the task."""
     charts: list[Chart] = field(default_factory=list)
     findings: list[str] = field(default_factory=list)
-    """Findings of the training's health checks."""
+    """Findings of the training's health checks, a sentence each."""
     evaluation: dict[str, Any] | None = None
+    """Result of an evaluation, as `rlcli eval --json` prints it."""
     checkpoint: str | None = None
+    """Name of the checkpoint's folder; None: the run has no checkpoint."""
     video: bytes | None = None
+    """Content of an MP4 file."""
     video_of: str = ""
     """Caption of the video: the checkpoint that it shows."""
     settings: list[tuple[str, list[Setting]]] = field(default_factory=list)
     """Sections of the configuration, each with its settings."""
     machine: list[tuple[str, str]] = field(default_factory=list)
     commands: list[tuple[str, str]] = field(default_factory=list)
-    """(description, command) of each command."""
+    """(description, command line) of each command that the page suggests."""
     missing: dict[str, str] = field(default_factory=dict)
     """Missing part of the page -> the reason, one sentence."""
 
@@ -85,7 +93,7 @@ def gather_page(run: Run, checkpoint: Path | None) -> Page:
 
     Args:
         run: the run.
-        checkpoint: the folder of the checkpoint that is described; None: the run has none.
+        checkpoint: the folder of the checkpoint that the page describes; None: the run has no checkpoint.
     """
     record = run.record
     page = Page(str(record["task"]["name"]), run.folder.resolve().name, "", [])
@@ -126,7 +134,11 @@ def _part(page: Page, name: str, failure: str, *errors: type[Exception]) -> Iter
 
 
 def _card(run: Run, document: strict_yaml.Document | None, checkpoint: Path | None) -> Card:
-    """Return the card of the run's task. If the task's code is not trusted or not installed, its terms are left out."""
+    """Return the task card of the run.
+
+    If the task's code is not trusted or not installed, the card has the stored configuration without the meanings of
+    terms.
+    """
     layout = _layout(checkpoint)
     try:
         return task_card(resolve_run(run, play=False), layout)
@@ -204,10 +216,10 @@ def _settings(run: Run, document: strict_yaml.Document) -> list[Setting]:
 
 
 def _installed(run: Run) -> tuple[dict[str, Any], dict[str, str]]:
-    """Return the settings of the run's task as it is installed now, to compare them with the run's.
+    """Return the settings of the installed task, to compare them with the settings of the run.
 
     Returns:
-        Dotted key -> value, and dotted key -> where the value is set; both are empty if the task is not installed.
+        Dotted key -> value, and dotted key -> where the value is set; both are empty if the task cannot be read.
     """
     from rlcli.config.dump import to_data
 
@@ -270,7 +282,7 @@ def _commands(run: Run, checkpoint: Path | None) -> Iterator[tuple[str, str]]:
 
 
 def reason_of(error: Exception) -> str:
-    """Return the message of an error as one sentence for the page."""
+    """Return the message of an error, and how to correct the error, as one sentence for the page."""
     if isinstance(error, RlcliError):
         text = error.message + (f" ({error.hint})" if error.hint else "")
     elif isinstance(error, ValidationError):

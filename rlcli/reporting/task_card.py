@@ -1,7 +1,8 @@
-"""Task card: tables that describe the task's Markov decision process, from its configuration and docstrings.
+"""Task cards: tables that describe a task's observations, actions, rewards and so on.
 
-Nothing is built or imported. Sizes of terms and names of joints come from the compiled model, so they are read from a
-layout: the `layout` of a checkpoint's manifest, or the `task.layout.json` that a task ships.
+A card is made from the configuration and the docstrings of terms; no environment is built, and no code of the task is
+imported. Sizes of terms and names of joints come from the compiled model, so they are read from a layout: the `layout`
+of a checkpoint's manifest, or the `task.layout.json` that a task ships.
 """
 
 import ast
@@ -117,7 +118,7 @@ def card(
 
 
 def markdown(content: Card, level: int = 1) -> str:
-    """Return a card as Markdown; `level` is the level of its first heading."""
+    """Return a task card as Markdown; `level` is the level of its first heading, 1 for `#`."""
     lines = [f"{'#' * level} {_cell(content.name)}", "", _cell(content.summary), ""]
     lines += ["| | |", "| --- | --- |", *(f"| {_cell(key)} | {_cell(value)} |" for key, value in content.facts), ""]
     for table in content.tables:
@@ -307,7 +308,7 @@ def _sensors(task: TaskConfig) -> Table:
 
 
 def _actuators(task: TaskConfig) -> Table:
-    """Return the table of actuator models; MuJoCo's own actuators are in the MJCF and are left out."""
+    """Return the table of actuator models; actuators of the MJCF are not part of the configuration and are left out."""
     rows = []
     for entity in task.scene.entities.values():
         for name, actuator in entity.actuators.items():
@@ -332,7 +333,7 @@ _HOOKS = {
 
 
 def _direct(task: TaskConfig, source: TaskSource | None) -> Iterable[Table]:
-    """Yield two tables of a direct task: its parameters, and the docstrings of its class, read from the source."""
+    """Yield two tables of a direct task: its parameters, and the docstrings of its class, read from its source file."""
     foreign = (leaf for block in task.foreign.values() if block for leaf in leaves(block))
     values = task.params | {dotted(path): value for path, value in foreign}
     described: dict[str, tuple[str, str]] = {}
@@ -356,7 +357,7 @@ def _direct(task: TaskConfig, source: TaskSource | None) -> Iterable[Table]:
 def _hooks(file: Path, class_name: str) -> list[tuple[str, str, str]]:
     """Return a row for the class of a direct task and for each of its hooks (methods) that has a docstring.
 
-    A row is: the part of the task that the hook decides, its name, and the first paragraph of its docstring.
+    A row is: the part of the task that the hook computes, the hook's name, and the first paragraph of its docstring.
     """
     docstrings: dict[str, str] = {}
     # base classes come first, so that the hooks of a class replace those of its bases
@@ -375,7 +376,10 @@ _UNIT = re.compile(r"\[([^\]]+)\]")
 
 
 def _meaning(section: str, config: TermConfig, vocabulary: Vocabulary) -> tuple[str, str]:
-    """Return a term's docstring without shapes, and its unit (empty if it has none)."""
+    """Return the description of a term without shapes, and its unit; the unit is empty if the docstring has none.
+
+    The description is the first paragraph of the docstring, or the term's name if there is no docstring.
+    """
     signature = vocabulary.find(section, config.func)
     if signature is None or not signature.description:
         return f"`{config.func}`", ""
@@ -387,8 +391,8 @@ def _meaning(section: str, config: TermConfig, vocabulary: Vocabulary) -> tuple[
 def _parameters(section: str, config: TermConfig, vocabulary: Vocabulary) -> str:
     """Return a term's parameters as text, such as `std` = 0.5.
 
-    The text does not contain selectors that match all joints, bodies or other elements (`.*`). It contains a default
-    value that names an entity, command or sensor only if the term's docstring mentions the parameter.
+    The text leaves out selectors that match all joints, bodies or other elements (`.*`), and default values that name
+    an entity, command or sensor, unless the term's docstring mentions the parameter.
     """
     signature = vocabulary.find(section, config.func)
     parameters = {p.name: p for p in signature.parameters} if signature else {}
@@ -413,7 +417,7 @@ def _without_empty_columns(table: Table) -> Table:
 
 
 def _cell(text: str) -> str:
-    """Return text as Markdown with all markup escaped, except code between backticks."""
+    """Return text for a Markdown cell, with all markup escaped, except code between backticks."""
     parts = " ".join(text.split()).split("`")
     plain = [re.sub(r"([\\*_\[\]#])", r"\\\1", html.escape(part, quote=False)) for part in parts[::2]]
     codes = [f"`{part}`" for part in parts[1::2]]

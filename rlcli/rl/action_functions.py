@@ -1,6 +1,6 @@
-"""Action functions, which map observations to actions: a trained policy, zero actions, or random actions.
+"""Functions from observations to actions, for evaluations and viewers: a trained policy, zero or random actions.
 
-Evaluations and viewers act with them. That of a trained policy also keeps its hidden state.
+The function of a trained policy also keeps the hidden state of a recurrent network.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from rlcli.envs.environment_protocol import Environment
 from rlcli.rl.policy import Policy
 
 Act = Callable[[Tensor], Tensor]
-"""Action function: observations (num_envs, d) -> actions (num_envs, a)."""
+"""Action function: observations of the policy (num_envs, d) -> actions (num_envs, a)."""
 PATIENCE = 10
-"""An evaluation stops after this number of full episode lengths; episodes that have not ended by then are cut off."""
+"""An evaluation ends an episode that is longer than this number times the task's `episode_length_s`."""
 
 
 def trained_policy(
@@ -30,8 +30,9 @@ def trained_policy(
         env: the environment.
         policy: the policy.
         stochastic: sample actions instead of taking the mean.
-        generator: source of the noise; environments that share a random stream then get the same noise. None: torch's
-            global generator, with different noise in every environment.
+        generator: random generator of the noise; environments that share a random stream
+            (`engine.shared_streams`) then get the same noise. None: torch's global generator, with different noise in
+            every environment.
     """
     hidden: Tensor | None = None
     repeats = env.num_envs // (env.engine.shared_streams or env.num_envs) if generator is not None else 1
@@ -47,15 +48,15 @@ def trained_policy(
 
 
 def zero_policy(env: Environment) -> Act:
-    """Return a function that always returns the zero action."""
+    """Return a function that returns zero actions (num_envs, a) for all observations."""
     action = torch.zeros(env.num_envs, env.layout.action_size, device=env.device)
     return lambda obs: action
 
 
 def random_policy(env: Environment, bound: float | None, seed: int) -> Act:
-    """Return a function that samples uniform actions in [-bound, bound], or standard Gaussian ones without a bound.
+    """Return a function that samples uniform actions in [-bound, bound]; standard Gaussian actions if `bound` is None.
 
-    Environments that share a random stream get the same actions.
+    Environments that share a random stream (`engine.shared_streams`) get the same actions.
     """
     generator = torch.Generator().manual_seed(seed)
     streams = env.engine.shared_streams or env.num_envs

@@ -1,6 +1,7 @@
 """Budget of a training: a limit of iterations, of environment steps, or both.
 
-The training loop ends when it is spent; schedules, such as the learning rate's, follow it.
+The training loop ends when the budget is spent. Schedules, such as that of the learning rate, depend on the remaining
+budget.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from rlcli.rl.trainer import Trainer
 class Budget:
     """Limits of a whole training; at least one is set.
 
-    They include iterations and steps before the run was resumed, so a resumed run trains only the rest.
+    The limits include iterations and steps before the run was resumed, so a resumed run trains only the rest.
     """
 
     max_iterations: int | None
@@ -29,7 +30,7 @@ class Budget:
         return trainer.iteration >= self.iterations(trainer)
 
     def iterations(self, trainer: Trainer) -> int:
-        """Return the number of iterations of the whole training, at which the first limit is reached."""
+        """Return the number of iterations of the whole training after which the first limit is reached."""
         limits = []
         if self.max_iterations is not None:
             limits.append(self.max_iterations)
@@ -42,7 +43,7 @@ class Budget:
 def remaining_budget(config: AgentConfig, trainer: Trainer) -> float:
     """Return the fraction of an agent's budget that is left, from 1 (start of the training) to 0 (end).
 
-    Schedules, such as the learning rate's, use the value. It is constant during an iteration.
+    Schedules, such as that of the learning rate, use the fraction. It changes only between iterations.
     """
     by_iterations = trainer.iteration / (config.max_iterations or math.inf)
     by_steps = trainer.iteration * trainer.steps_per_iteration / (config.max_steps or math.inf)

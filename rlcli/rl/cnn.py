@@ -1,6 +1,6 @@
 """Convolutional neural network over the images of an observation, for actor, critic and saved policies.
 
-Its features replace the columns of the images; other columns stay as they are.
+The features of the network replace the columns of the images; other columns of the observation stay as they are.
 """
 
 from __future__ import annotations
@@ -18,7 +18,10 @@ _Size = Annotated[int, Field(ge=1, le=4096)]
 
 
 class ImageSpec(BaseModel):
-    """Place of an image in an observation vector, which has its pixels in the order (channels, rows, columns)."""
+    """Place of an image in an observation vector: its first column and its shape.
+
+    The pixels of the image are consecutive columns, in the order (channels, rows, columns).
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -93,18 +96,21 @@ class CnnSpec(BaseModel):
         return sizes
 
     def features(self, columns: int) -> int:
-        """Return the number of outputs of `Cnn` for `columns` columns: image features, then the columns of no image."""
+        """Return the number of outputs of `Cnn` for an observation with `columns` columns.
+
+        The outputs are the image features and the columns that belong to no image.
+        """
         kept = columns - sum(math.prod(image.shape) for image in self.pictures)
         return kept + sum(math.prod(self.sizes(image)[-1]) for image in self.pictures)
 
 
 class Cnn(nn.Module):
-    """CNN over the images of an observation. Its outputs are their features, then the other columns.
+    """CNN over the images of an observation. The outputs are the features of all images, then the other columns.
 
     Args:
         spec: the images and the layers.
         activation: activation after each layer.
-        wide: compute in float64, as `WideLinear` does, with `WideConv`.
+        wide: compute in float64, so that batches of any size give the same float32 actions (`WideConv`).
     """
 
     def __init__(self, spec: CnnSpec, activation: type[nn.Module], *, wide: bool = False) -> None:
@@ -121,7 +127,7 @@ class Cnn(nn.Module):
             self.pictures.append(nn.Sequential(*layers))
 
     def forward(self, obs: Tensor) -> Tensor:
-        """Return the features. (n, columns) -> (n, features)"""
+        """Return the features of the images, then the other columns of `obs`. (n, columns) -> (n, features)"""
         features, rest, end = [], [], 0
         for image, layers in zip(self.spec.pictures, self.pictures, strict=True):
             pixels = torch.unflatten(obs[:, image.start : image.stop], 1, image.shape)
@@ -137,7 +143,7 @@ class Cnn(nn.Module):
 def motion_channels(pixels: Tensor, steps: int, factor: float) -> Tensor:
     """Replace each older image of a history by (newest - older) * factor; the oldest image has the first channels.
 
-    (n, steps x c, h, w) -> the same shape.
+    (n, steps x c, h, w) -> the same shape. `steps` is the number of images in the history.
     """
     frames = torch.unflatten(pixels, 1, (steps, -1))
     newest = frames[:, -1:]
@@ -151,7 +157,7 @@ class WideConv(nn.Conv2d):
     """
 
     def forward(self, x: Tensor) -> Tensor:
-        """Return the convolution. (n, c, h, w) -> (n, k, rows, columns) float64"""
+        """Return the convolution without padding. (n, c, h, w) -> (n, output channels, rows, columns) float64"""
         _, channels, height, width = x.shape
         edge, step = self.kernel_size[0], self.stride[0]
         rows, columns = (height - edge) // step + 1, (width - edge) // step + 1

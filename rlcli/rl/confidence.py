@@ -1,6 +1,6 @@
-"""95 % confidence intervals of rates, means and comparisons of finished episodes.
+"""95 % confidence intervals of success rates, of mean returns, and of the difference between two policies.
 
-Evaluations print them, and `--until` ends a training by them.
+Evaluations print the intervals; `rlcli train --until` compares a limit with them.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _BLOCK = 2**21
 
 
 def proportion(hits: int, count: int) -> dict[str, float]:
-    """Return the `rate` hits / count with its Wilson score interval from `low` to `high` (Wilson 1927)."""
+    """Return the `rate` hits / count, and the ends `low` and `high` of its 95 % Wilson score interval (Wilson 1927)."""
     z = NORMAL
     rate = hits / count
     middle = (rate + z * z / (2 * count)) / (1 + z * z / count)
@@ -35,7 +35,10 @@ def proportion(hits: int, count: int) -> dict[str, float]:
 
 
 def mean(values: Sequence[float]) -> dict[str, float | None]:
-    """Return `mean` and `std` with Student's t interval from `low` to `high`, which are None for a single value."""
+    """Return `mean` and `std` of values, and the ends `low` and `high` of Student's 95 % interval of the mean.
+
+    Both ends are None for a single value.
+    """
     count = len(values)
     middle = math.fsum(values) / max(1, count)  # exact: the result does not depend on the order of the episodes
     if count < 2:
@@ -62,9 +65,9 @@ def student_quantile(freedom: int) -> float:
 
 
 def difference(left: Sequence[float], right: Sequence[float]) -> dict[str, float | None]:
-    """Return the `mean` of left[i] - right[i], with its percentile bootstrap interval from `low` to `high`.
+    """Return the `mean` of left[i] - right[i], and the ends `low` and `high` of its 95 % interval.
 
-    The interval (Efron 1979) is None for a single pair of values.
+    The interval is a percentile bootstrap (Efron 1979); both ends are None for a single pair of values.
     """
     gaps = np.asarray(left, dtype=np.float64) - np.asarray(right, dtype=np.float64)
     middle = float(gaps.mean())
@@ -75,11 +78,12 @@ def difference(left: Sequence[float], right: Sequence[float]) -> dict[str, float
 
 
 def improvement(left: Sequence[float], right: Sequence[float]) -> dict[str, float | None]:
-    """Return the `probability` that a random episode of `left` exceeds one of `right`, with its interval `low`, `high`.
+    """Return the `probability` that a random value of `left` exceeds a random value of `right`, with `low` and `high`.
 
-    A pair of equal values counts one half. This is the statistic of Mann and Whitney (1947) as a probability of
-    improvement (Agarwal et al. 2021). The bootstrap interval resamples episodes with the same index in the two lists
-    together, because they start in the same state.
+    The values are of episodes, such as their returns. A pair of equal values counts one half. The probability is the
+    statistic of Mann and Whitney (1947) as a probability of improvement (Agarwal et al. 2021). `low` and `high` are the
+    ends of its 95 % bootstrap interval, None for a single pair. The bootstrap resamples episodes with the same index in
+    both lists together, because they start in the same state.
     """
     one, other = np.asarray(left, dtype=np.float64), np.asarray(right, dtype=np.float64)
     probability = _exceeds(one, other)
@@ -98,7 +102,10 @@ def _exceeds(left: NDArray[np.float64], right: NDArray[np.float64]) -> float:
 
 
 def _resampled(count: int) -> list[NDArray[np.int64]]:
-    """Return the indices of all bootstrap samples, drawn with replacement, in blocks of `_BLOCK` numbers. (n, count)"""
+    """Return the indices of all bootstrap samples of `count` values, drawn with replacement; one sample a row.
+
+    The rows are split into blocks (n, count) of at most `_BLOCK` numbers.
+    """
     generator = np.random.default_rng(_SEED)
     block = max(1, _BLOCK // count)
     starts = range(0, RESAMPLES, block)

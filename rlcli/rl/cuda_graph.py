@@ -1,4 +1,4 @@
-"""Recording of a repeated function, such as a rollout, as a CUDA graph, and its replay.
+"""Record a repeated function, such as a rollout, as a CUDA graph, and replay the graph instead of the function.
 
 A graph records the function's kernel launches on fixed memory addresses. The function has no arguments, must not read a
 value back from the device, and must keep the addresses of tensors that it uses from one call to the next. Tensors that
@@ -43,6 +43,11 @@ class Recording:
     Only the first call may synchronise with the device. After a call that neither synchronises nor changes a Python
     number in the attributes of `holders`, the next call is recorded. A function that cannot be recorded always runs
     eagerly, after a warning.
+
+    Args:
+        work: the function.
+        device: the GPU on which the function computes.
+        holders: objects whose attributes the function keeps from one call to the next.
     """
 
     def __init__(self, work: Work, device: torch.device, holders: list[Any]) -> None:
@@ -129,7 +134,7 @@ class Recording:
 
 
 def _copy_back(tensors: list[tuple[Any, str, Tensor]]) -> None:
-    """Copy the tensors that the function has replaced by new ones back into the old memory, which a replay reads.
+    """Copy tensors that the recorded function has replaced by new ones into the old memory, which a replay reads.
 
     `tensors` has entries (object, name of the attribute, tensor of this attribute before the call).
     """

@@ -1,7 +1,8 @@
-"""Data-parallel training of one policy in several processes, which PyTorch's launcher starts.
+"""Processes of a data-parallel training: start them, join their group, and average or gather values.
 
-Every process has its own environments and a copy of the networks. Gradients, KL divergences, observation statistics and
-metrics are averaged over all processes. Only rank 0 writes the run and prints.
+PyTorch's launcher starts the processes. Every process has its own environments and a copy of the networks. Gradients,
+KL divergences, observation statistics and metrics are averaged over all processes. Only rank 0 writes the run and
+prints.
 """
 
 from __future__ import annotations
@@ -27,9 +28,10 @@ _TIMEOUT = timedelta(minutes=10)
 
 @dataclass(frozen=True, slots=True)
 class ProcessGroup:
-    """Group of the processes that train one policy together; it knows the rank of this process.
+    """Group of the processes that train one policy together, with the rank of this process.
 
-    With a world size of 1 (a single process) the methods return at once, without communication.
+    With a world size of 1 (a single process) the methods return at once, without communication. With more processes,
+    all of them must call the methods in the same order; a method raises `MachineError` if another process has ended.
     """
 
     rank: int = 0
@@ -38,13 +40,13 @@ class ProcessGroup:
 
     @property
     def is_rank_zero(self) -> bool:
-        """Whether this process writes the run and prints."""
+        """Whether this process has rank 0, and so writes the run and prints."""
         return self.rank == 0
 
     def seed(self, seed: int, purpose: str) -> int:
         """Return this process's own seed for a purpose, such as exploration.
 
-        It is `seed` itself on rank 0, and a seed derived from `seed`, the purpose and the rank on the other ranks.
+        On rank 0 the result is `seed` itself; on other ranks it is derived from `seed`, the purpose and the rank.
         """
         if self.is_rank_zero:
             return seed
@@ -53,14 +55,14 @@ class ProcessGroup:
         return derive(seed, f"{purpose} of process {self.rank}")
 
     def average_(self, values: Tensor) -> Tensor:
-        """Replace values by their mean over all processes, in place."""
+        """Replace the elements of a tensor by their means over all processes, in place; return the tensor."""
         if self.world_size > 1:
             _communicate("all_reduce", values)
             values /= self.world_size
         return values
 
     def broadcast_(self, values: Tensor) -> None:
-        """Replace values by the values of rank 0, in place."""
+        """Replace the elements of a tensor by those of rank 0, in place."""
         if self.world_size > 1:
             _communicate("broadcast", values, 0)
 
@@ -93,12 +95,12 @@ _current = ProcessGroup()
 
 
 def current() -> ProcessGroup:
-    """Return the process group of this run."""
+    """Return the group that this process has joined by `join`; before that, a group with a world size of 1."""
     return _current
 
 
 def launched() -> bool:
-    """Return whether a launcher started this process as one of several."""
+    """Return whether a launcher (torchrun) started this process as one of several; it sets RANK and WORLD_SIZE."""
     return "RANK" in os.environ and launcher_number("WORLD_SIZE", 1, least=1) > 1
 
 
@@ -115,7 +117,12 @@ def local_rank_and_size() -> tuple[int, int]:
 
 
 def join(device: str) -> ProcessGroup:
-    """Join the process group, with NCCL for GPU tensors and gloo for all others.
+    """Join the group of all processes that the launcher started, and return the group.
+
+    NCCL transfers tensors on GPUs, gloo all others. A single process gets a group with a world size of 1.
+
+    Args:
+        device: device of this process's networks: cpu or cuda:N.
 
     Raises:
         MachineError: if the other processes cannot be reached.
@@ -136,14 +143,14 @@ def join(device: str) -> ProcessGroup:
         dist.init_process_group("cpu:gloo,cuda:nccl" if on_gpu else "gloo", timeout=_TIMEOUT)
     except (RuntimeError, ValueError) as error:
         message = f"cannot connect to the other training processes: {' '.join(str(error).split())}"
-        hint = f"start all {os.environ.get('WORLD_SIZE', '')} processes"
+        hint = f"start all {os.environ.get('WORLD_SIZE', '')} processes of the training (WORLD_SIZE)"
         raise MachineError(message, hint=hint) from error
     _current = ProcessGroup(dist.get_rank(), dist.get_world_size(), device)
     return _current
 
 
 def leave() -> None:
-    """Leave the process group."""
+    """Leave the process group; `current` then returns a group with a world size of 1."""
     global _current
     if _current.world_size > 1:
         import gc
@@ -157,11 +164,11 @@ def leave() -> None:
 
 
 def launch(processes: int, arguments: Sequence[str]) -> int:
-    """Run `rlcli ARGUMENTS` in several processes of this machine.
+    """Run `rlcli ARGUMENTS` in several processes of this machine, and wait until all have ended.
 
     Returns:
-        0 if all processes succeed. If a signal stopped the launcher: the exit code for that signal. Else the exit code
-        of the process whose failure was the cause; processes that fail because another one is gone do not count.
+        The exit code: 0 if all processes succeed; if a signal stopped the launcher, the exit code for that signal; else
+        that of the process whose failure was the cause. Processes that failed because another had ended do not count.
     """
     import logging
 
@@ -187,8 +194,8 @@ def launch(processes: int, arguments: Sequence[str]) -> int:
 def _exit_code(codes: Sequence[int]) -> int:
     """Return the exit code of the run, from the exit codes of its processes.
 
-    Ignore processes that the launcher killed (negative codes) and those that ended because another process was gone
-    (`MachineError`).
+    Ignore processes that the launcher killed (negative codes), and processes that ended because another had ended
+    (exit code of `MachineError`).
     """
     own = [code for code in codes if code > 0 and code != MachineError.exit_code]
     return next(iter(own), MachineError.exit_code)
@@ -198,12 +205,12 @@ def _communicate(operation: str, *arguments: Any) -> None:
     """Call a collective operation (such as `all_reduce`) of `torch.distributed`.
 
     Raises:
-        MachineError: if another process is gone.
+        MachineError: if another process has ended.
     """
     import torch.distributed as dist
 
     try:
         getattr(dist, operation)(*arguments)
     except RuntimeError as error:
-        hint = "read the message of that process; --resume continues from the last checkpoint"
-        raise MachineError("another process of this training has ended, so this one stops, too", hint=hint) from error
+        hint = "read the message of that process; `rlcli train --resume RUN` continues from the last checkpoint"
+        raise MachineError("another process of this training has ended, so this process stops", hint=hint) from error

@@ -1,6 +1,6 @@
 """Statistics of the episodes that finish during a training: returns, lengths, terminations, success.
 
-The names of the metrics are those of RSL-RL, so that its dashboards can be used.
+The metrics have the names of RSL-RL, so that dashboards made for RSL-RL can show them.
 """
 
 from __future__ import annotations
@@ -33,15 +33,16 @@ class EpisodeStatistics:
     - `Episode_Reward/<term>`: mean sum of the term over an episode, divided by the full episode length [s] (Isaac
       Lab's definition);
     - `Episode_Termination/<term>`: share of the episodes that the term ended;
-    - `Metrics/<command>/<metric>`: mean of `Episodes.metrics`;
-    - `Success/<condition>`: share of the episodes at whose end the condition of success held;
+    - `Metrics/<command>/<metric>`: mean of a metric that a command term computes, such as its tracking error; in a
+      direct task `Metrics/<metric>`;
+    - `Success/<condition>`: share of the episodes in whose last `hold_s` seconds the condition of success held;
     - `Success_Value/<condition>`: mean of the condition's value in the last step.
 
     The sums stay on the environment's device, so that adding to them forces no host sync.
     """
 
     WINDOW = 100
-    """Number of finished episodes that the metrics `Train/*` average over at least."""
+    """Smallest number of finished episodes over which the metrics `Train/*` are averaged, once so many have ended."""
 
     def __init__(self, episode_length_s: float) -> None:
         self._episode_length_s = episode_length_s
@@ -50,7 +51,10 @@ class EpisodeStatistics:
         self.total = 0
 
     def add(self, episodes: Episodes | None) -> None:
-        """Add the episodes that ended in a step; with `episodes.mask`, only those where it is true."""
+        """Add the episodes that ended in a step; if `episodes.mask` is not None, only those where the mask is true.
+
+        `episodes` is `StepResult.episodes`; None: no episode ended.
+        """
         if episodes is None:
             return
         values = {"return": episodes.returns, **{f"term.{k}": v for k, v in episodes.reward_terms.items()}}
@@ -72,7 +76,7 @@ class EpisodeStatistics:
         self._sums[names].addmv_(matrix, weight)
 
     def all_reduce(self, process_group: ProcessGroup) -> None:
-        """Sum the statistics over all processes; until every process has finished an episode, change nothing."""
+        """Sum the statistics over all processes; change nothing while a process has not yet finished an episode."""
         own = len(self._sums)
         (total,) = process_group.sum(own)
         if own and total == own * process_group.world_size:
@@ -80,7 +84,10 @@ class EpisodeStatistics:
                 process_group.average_(values).mul_(process_group.world_size)
 
     def flush(self) -> dict[str, float]:
-        """Return the metrics of the iteration and reset its sums; metrics without an episode are left out."""
+        """Return the metrics of the iteration, by name, and begin a new iteration.
+
+        In an iteration without finished episodes, only the metrics `Train/*` are returned.
+        """
         sums: dict[str, float] = {}
         for names, values in self._sums.items():
             for name, value in zip(names.split(","), values.tolist(), strict=True):
@@ -95,7 +102,7 @@ class EpisodeStatistics:
         return {**self._means(), **self._episode_means(sums, count)}
 
     def state(self) -> dict[str, Any]:
-        """Return the sums of the recent iterations as data for JSON, to save them between two iterations."""
+        """Return the sums over the recent iterations as JSON data, for a checkpoint between two iterations."""
         return {"recent": [list(row) for row in self._recent], "total": self.total}
 
     def load(self, state: dict[str, Any]) -> None:

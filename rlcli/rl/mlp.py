@@ -1,7 +1,7 @@
 """Multilayer perceptrons on a CPU, with the fastest operations of MKL, oneDNN and numpy.
 
-torch uses MKL for matrix products. MKL uses AVX-512 only on Intel processors: on AMD processors oneDNN is twice as
-fast, on Intel processors it is slower. numpy's expm1 is three times as fast as torch's, and its tanh ten times.
+torch uses MKL for matrix products. MKL uses AVX-512 only on Intel processors: on AMD processors oneDNN is twice as fast
+as MKL, on Intel processors it is slower. numpy's expm1 is three times as fast as torch's, and numpy's tanh ten times.
 """
 
 from __future__ import annotations
@@ -67,14 +67,20 @@ def affine(x: Tensor, weight: Tensor, bias: Tensor, out: Tensor | None = None) -
 
 
 def input_gradient(gradient: Tensor, weight: Tensor, out: Tensor) -> Tensor:
-    """Return the gradient of a layer's inputs, in `out` or in new memory. (n, o), (o, i) -> (n, i)"""
+    """Return the gradient of the loss with respect to a linear layer's inputs, in `out` or in new memory.
+
+    (n, o), (o, i) -> (n, i). `gradient` is the gradient with respect to the layer's outputs.
+    """
     if _linear is not None and len(gradient) * weight.numel() >= _WORTH:
         return _linear(gradient, weight.t())
     return torch.mm(gradient, weight, out=out)
 
 
 def weight_gradient(inputs: Tensor, gradient: Tensor, out: Tensor) -> None:
-    """Write the gradient of a layer's weights, transposed. (n, i), (n, o) -> (i, o)"""
+    """Write the gradient of the loss with respect to a linear layer's weights, transposed, to `out`.
+
+    (n, i), (n, o) -> (i, o). `gradient` is the gradient with respect to the layer's outputs.
+    """
     if _linear is not None and out.numel() >= _LARGE and len(inputs) * out.numel() >= _WORTH:
         out.copy_(_linear(inputs.t(), gradient.t()))
     else:
@@ -130,7 +136,7 @@ def is_plain(layers: Iterable[nn.Module]) -> bool:
 class Mlp(nn.Sequential):
     """Multilayer perceptron that uses the fast operations of this module while autograd is off.
 
-    While autograd is on it uses torch's operations. The fast operations call no hooks of the layers. The samples are
+    While autograd is on, torch's operations are used. The fast operations call no hooks of the layers. The samples are
     split into parts, whose hidden layers the threads of `use_threads` compute. The parts do not depend on the number of
     threads. The last layer is computed for all samples at once: the rounding of a product with one column depends on
     the number of its rows.

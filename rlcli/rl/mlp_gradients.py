@@ -22,8 +22,8 @@ from torch import Tensor, nn
 from rlcli.rl.mlp import FAST_ACTIVATIONS, affine, input_gradient, part_rows, weight_gradient
 
 _PARTS = 2
-"""Number of parts of a large minibatch. Two networks with two parts each occupy the default number of threads, four.
-More parts mean shorter operations, and a thread waits for Python's lock between two operations."""
+"""Smallest number of parts of a large minibatch. Two networks with two parts each occupy the default number of threads,
+four. More parts mean shorter operations, and a thread waits for Python's lock between two operations."""
 Layers = Iterable[nn.Module]
 OutputGradient = Callable[[slice, Tensor], tuple[Tensor, Tensor]]
 """Function `(rows, outputs) -> (gradient, statistics)` for one part of a minibatch.
@@ -80,14 +80,14 @@ class PartMemory:
     def gradients_of(self, network: int, part: int) -> list[Tensor]:
         """Return the tensors for the gradients of one network (0: actor, 1: critic) on one part of the minibatch.
 
-        They are transposed: (inputs, outputs) for weights.
+        The tensors alternate between weights, transposed (inputs, outputs), and biases (outputs,), layer by layer.
         """
         return self._views[part][self._ends[network] : self._ends[network + 1]]
 
     def sum_parts(self, rows: int, out: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-        """Add up the results of all parts of a minibatch, and write its gradients to `out`.
+        """Add up the results of all parts of a minibatch of `rows` samples, and write its gradients to `out`.
 
-        Return the statistics that `OutputGradient` computes: those of the actor, (columns,), and of the critic, ().
+        Return the sums of the statistics that `OutputGradient` computes: of the actor (columns,), and of the critic ().
         """
         parts = len(self.split(rows))
         torch.sum(self._gradients[:parts], dim=0, out=self._sum)
@@ -147,13 +147,17 @@ class MlpGradients:
     def __call__(
         self, obs: Tensor, critic_obs: Tensor, actor_gradient: OutputGradient, critic_gradient: OutputGradient
     ) -> tuple[Tensor, Tensor]:
-        """Write the gradients of a minibatch to `gradients`; return (the actor's, the critic's) summed statistics.
+        """Write the gradients of a minibatch to `gradients`; return the statistics, summed over all samples.
 
         Args:
             obs: inputs of the actor. (n, d)
             critic_obs: inputs of the critic. (n, c)
-            actor_gradient: gradient of the loss with respect to the actor's outputs, and statistics.
+            actor_gradient: function that computes the gradient of the loss with respect to the actor's outputs, and
+                statistics.
             critic_gradient: the same for the critic.
+
+        Returns:
+            The statistics of the actor, (columns,), and of the critic, ().
         """
         tasks = deque(self._memory.tasks(len(obs)))
 
@@ -187,7 +191,7 @@ class _Passes:
         self._outputs: list[Tensor] = []
 
     def forward(self, inputs: Tensor) -> Tensor:
-        """Return the outputs in memory that the next call overwrites. (n, d) -> (n, outputs)"""
+        """Return the outputs of the network, in memory that the next call overwrites. (n, d) -> (n, outputs)"""
         self._inputs, rows = [inputs], len(inputs)
         *hidden, last = self._weights
         self._outputs = []
@@ -200,7 +204,10 @@ class _Passes:
         return affine(inputs, *last, out=self._linear_buffers[-1][:rows])
 
     def backward(self, gradient: Tensor, gradients: Sequence[Tensor]) -> None:
-        """Write the gradients of weights and biases, given the gradient of the outputs. (n, outputs)"""
+        """Write the gradients of weights and biases for the samples of the last `forward` to `gradients`.
+
+        `gradient` is the gradient of the loss with respect to the outputs. (n, outputs)
+        """
         for number in reversed(range(len(self._weights))):
             inputs = self._inputs[number]
             weight_gradient(inputs, gradient, gradients[2 * number])

@@ -1,7 +1,7 @@
 """Checks for NaN and infinity in a trainer's tensors.
 
-Tensors are checked in the order in which they are computed. The error names the first one that is not finite, because
-it is the cause: NaN spreads to all tensors that are computed from it.
+Tensors are checked in the order in which they are computed. The error names the first tensor that is not finite,
+because that tensor is the cause: NaN spreads to all tensors that are computed from it.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ LEARNER_HINT = "lower learning_rate or max_grad_norm; the last good checkpoint i
 def require_finite(
     tensors: Iterable[tuple[str, Tensor]], iteration: int, axes: tuple[str, ...] = (), hint: str = LEARNER_HINT
 ) -> None:
-    """Check that all tensors are finite; the error names the first tensor that is not, because it is the cause.
+    """Check that all tensors are finite.
 
     Args:
         tensors: names and values, each tensor after those from which it is computed.
         iteration: index of the iteration, for the message.
-        axes: names of the leading axes, such as `("step", "environment")`.
+        axes: names of the leading axes, for the message, such as `("step", "environment")`.
         hint: what the user can do.
 
     Raises:
-        DivergedError: with the first tensor that is not finite and the index of its first such value.
+        DivergedError: with the first tensor that is not finite, and the index of its first value that is not finite.
     """
     for name, values in tensors:
         if is_finite(values):
@@ -44,13 +44,16 @@ def require_finite(
         count = f" in {int(bad.sum())} of {bad.numel()} values" if bad.numel() > 1 else ""
         raise DivergedError(
             f"{name} is not finite{count}{f' ({where})' if where else ''}, in iteration {iteration}; all tensors"
-            " that were computed before it are finite",
+            " that were computed earlier are finite",
             hint=hint,
         )
 
 
 def moments(normalizers: Iterable[tuple[str, Normalizer | None]]) -> list[tuple[str, Tensor]]:
-    """Return (name, value) of mean, variance and count of each normaliser, for `require_finite`."""
+    """Return (name, value) of mean, variance and count of each normaliser, for `require_finite`.
+
+    `normalizers` are (name, normaliser); None is skipped.
+    """
     return [
         (f"the {name} normaliser's {moment}", getattr(normalizer, moment))
         for name, normalizer in normalizers
@@ -90,7 +93,7 @@ class GradientWatch:
 
     def __init__(self, module: nn.Module, optimizers: Iterable[torch.optim.Optimizer]) -> None:
         self.first: str | None = None
-        """First parameter whose gradient is not finite, in the order of the backward pass; None: all are finite."""
+        """Name of the first parameter whose gradient was not finite, in the order of the backward pass; None: none."""
         for name, parameter in module.named_parameters():
             if parameter.requires_grad:
                 hook = functools.partial(self._check, name)

@@ -1,7 +1,4 @@
-"""Functions that save and load the state of an optimiser as named tensors, and an Adam that imports fast.
-
-Trainers call them for checkpoints.
-"""
+"""Save and load the state of optimisers as named tensors, for checkpoints; and a variant of Adam that imports fast."""
 
 from __future__ import annotations
 
@@ -41,7 +38,8 @@ def below(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
 def optimizer_tensors(optimizer: torch.optim.Optimizer, prefix: str) -> dict[str, Tensor]:
     """Return a copy of an optimiser's state as tensors by name.
 
-    A name is the prefix, the index of a parameter, and the name of Adam's value: `0.exp_avg`.
+    A name is the prefix, the index of a parameter, and the name of a value that the optimiser keeps for the parameter,
+    such as `0.exp_avg` of Adam.
     """
     return {
         f"{prefix}{number}.{slot}": torch.as_tensor(value).clone()
@@ -55,7 +53,7 @@ def load_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tenso
     """Restore an optimiser's state from the tensors of a checkpoint; settings such as the learning rate do not change.
 
     Raises:
-        ValueError: with the first tensor that is missing or has another shape.
+        ValueError: if a tensor is missing, has another shape, or is of a parameter that the optimiser does not have.
     """
     state: dict[int, dict[str, Tensor]] = {}
     for name, value in below(tensors, prefix).items():
@@ -86,5 +84,5 @@ def _require_slots(optimizer: torch.optim.Optimizer, state: Mapping[int, Mapping
             if tuple(value.shape) != expected or not value.is_floating_point():
                 raise ValueError(
                     f"trainer: the saved optimiser state {name} of parameter {number} is {value.dtype}"
-                    f" {tuple(value.shape)}, the present agent needs {expected}"
+                    f" {tuple(value.shape)}, but the agent needs {expected}: the agent's networks have changed"
                 )

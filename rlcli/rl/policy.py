@@ -1,6 +1,6 @@
-"""Policy as it is saved, played and exported: a network from raw observations to the actions of `env.step`.
+"""Policies as they are saved, played and exported: networks from raw observations to the actions of `env.step`.
 
-It includes the normalisation of observations. In training, trainers use faster networks with the same weights.
+A policy includes the normalisation of observations. In training, trainers use faster networks with the same weights.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _LOG_STD_RANGE = (-20.0, 2.0)
 _MAX_BYTES = 2**31
 _OTHER = "export it again, or use another checkpoint"
 _LogStd = Annotated[float, Field(ge=-80, le=80)]
-"""Largest absolute value of a log standard deviation: the standard deviation must fit into a float32."""
+"""Log standard deviation; the limits keep the standard deviation in the range of float32."""
 Layers = Annotated[list[Width], Field(max_length=100)]
 """Width of each layer."""
 
@@ -45,7 +45,7 @@ class PolicySpec(BaseModel):
         "gaussian-mlp"
     )
     group: Annotated[str, Field(max_length=200)] = "policy"
-    """Observation group that the policy receives."""
+    """Observation group that the policy reads."""
     observation_size: Width
     """Number of observation columns."""
     action_size: Width
@@ -112,18 +112,18 @@ class Normalizer(nn.Module):
         self.register_buffer("count", torch.zeros((), dtype=torch.float64))
 
     def forward(self, obs: Tensor) -> Tensor:
-        """Return (obs - mean) / std, clipped. (n, d)"""
+        """Return (obs - mean) / std, clipped to +-`clip`. (n, d) -> (n, d)"""
         scale = (self.var + self.EPSILON).rsqrt().float()
         normal = (obs - self.mean.float()) * scale
         return normal if self.clip is None else normal.clamp(-self.clip, self.clip)
 
     def update(self, obs: Tensor) -> None:
-        """Update the statistics with a batch. (n, d)"""
+        """Update mean, variance and count with a batch of observations. (n, d)"""
         batch = obs.double()
         self.merge(batch.mean(dim=0), batch.var(dim=0, unbiased=False), float(len(batch)))
 
     def merge(self, mean: Tensor, var: Tensor, count: float) -> None:
-        """Update the statistics with the mean and the variance of `count` samples. (d,)"""
+        """Update mean, variance and count with the mean and the variance of `count` samples. (d,), (d,)"""
         total = self.count + count
         delta = mean - self.mean
         # Chan, Golub and LeVeque 1979, equation 2.1b: sums of squares add up, plus delta^2 n_a n_b / (n_a + n_b)
@@ -169,7 +169,12 @@ class Lstm(nn.Module):
         return torch.zeros(rows, 2 * sum(self.cells), dtype=self.dtype, device=next(self.parameters()).device)
 
     def forward(self, x: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the output, (n, cells of the last layer), and the next hidden state. (n, inputs), (n, m)"""
+        """Return the output, (n, cells of the last layer), and the next hidden state, (n, m).
+
+        Args:
+            x: inputs. (n, inputs)
+            memory: hidden state, with the columns that `blank` describes. (n, m)
+        """
         parts, after = memory.split_with_sizes([size for size in self.cells for _ in range(2)], dim=1), []
         x = x.to(self.dtype)
         for layer, output, cell in zip(self.layers, parts[::2], parts[1::2], strict=True):
@@ -231,8 +236,8 @@ class Policy(nn.Module):
             obs: raw observations. (n, observation_size)
             memory: hidden state, or None at the start of an episode. (n, m)
             stochastic: sample the action instead of taking the mean.
-            generator: source of the noise; None: torch's global generator.
-            noise_repeats: sample noise for the first n / noise_repeats rows and repeat it for the others.
+            generator: random generator of the noise; None: torch's global generator.
+            noise_repeats: sample noise for the first n / noise_repeats rows, and repeat this noise for the other rows.
         """
         inputs = obs if self.normalizer is None else self.normalizer(obs)
         if self.memory is not None:
@@ -266,7 +271,11 @@ class Policy(nn.Module):
 
 
 def mlp(inputs: int, hidden: list[int], outputs: int, activation: str) -> nn.Sequential:
-    """Return linear layers that compute in float64, with activations between them."""
+    """Return linear layers that compute in float64, with activations between them.
+
+    `inputs` and `outputs` are numbers of columns, `hidden` the widths of the hidden layers; `activation` is a key of
+    `ACTIVATIONS`.
+    """
     layers: list[nn.Module] = []
     for width in hidden:
         layers += [WideLinear(inputs, width), ACTIVATIONS[activation]()]
@@ -289,7 +298,7 @@ def blank_policy(spec: Mapping[str, object]) -> Policy:
     No memory is allocated, so a small untrusted file cannot cause a large allocation.
 
     Raises:
-        CheckpointError: if the specification is not valid.
+        CheckpointError: if the specification is not valid, or the policy would be larger than 2 GiB.
     """
     try:
         checked = PolicySpec.model_validate(spec)

@@ -1,6 +1,7 @@
-"""Functions that seed, save and restore the global random generators of torch, numpy and Python.
+"""Seed, save and restore the global random generators of torch, numpy and Python.
 
-Trainers save the states in checkpoints; evaluations restore them, so that a training is not changed.
+Trainers save the states of the generators in checkpoints. Evaluations during a training restore the states, so that
+they do not change the training.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ def seed_generators(seed: int) -> None:
 
 
 def rng_state() -> dict[str, Tensor]:
-    """Return the states of the global generators of torch, numpy and Python as tensors of a checkpoint."""
+    """Return copies of the states of the global generators of torch (CPU), numpy and Python, as tensors by name."""
     kind, keys, position, has_gauss, gauss = np.random.get_state()
     assert kind == "MT19937"
     version, words, next_gauss = random.getstate()
@@ -41,9 +42,9 @@ def rng_state() -> dict[str, Tensor]:
 
 @contextlib.contextmanager
 def undisturbed() -> Iterator[None]:
-    """Run the `with` block so that it does not change later random numbers.
+    """Run a `with` block that must not change the random numbers after it.
 
-    The block runs with one torch thread; after it, the global generators and the number of threads are restored.
+    The block runs with one torch thread; afterwards the global generators and the number of threads are restored.
     """
     rng, threads = rng_state(), torch.get_num_threads()
     torch.set_num_threads(1)

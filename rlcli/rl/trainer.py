@@ -1,6 +1,6 @@
-"""Protocol `Trainer`, through which the training loop calls a trainer, and the data that they exchange.
+"""Interface `Trainer` between the training loop and every trainer, built in or from a plugin.
 
-Every trainer, built in or from a plugin, has this interface.
+`TrainerState` and `Report` are the data that a trainer returns to the training loop.
 """
 
 from __future__ import annotations
@@ -66,19 +66,28 @@ class Trainer(Protocol):
         """Environment steps so far, over all environments and processes."""
 
     def start(self) -> None:
-        """Reset the environment. It is called once, before the first iteration of a run that is not resumed."""
+        """Reset the environment. The training loop calls this once, before the first iteration of a new run.
+
+        In a resumed run `load` is called instead.
+        """
 
     def iterate(self) -> Report:
-        """Do one iteration: collect experience, then update."""
+        """Do one iteration: collect experience, then update the networks; return metrics and durations."""
 
     def policy(self) -> Policy:
         """Return the current policy, with a copy of the weights."""
 
     def state(self) -> TrainerState:
-        """Return a copy of the state; the rows of its `logs` can be read until the end of the next iteration."""
+        """Return a copy of the state for a checkpoint, between two iterations.
+
+        The rows of its `logs` are not copied yet: they can be read until the end of the next iteration.
+        """
 
     def load(self, state: TrainerState) -> None:
         """Restore the state returned by `state()`."""
 
     def load_weights(self, policy: Mapping[str, Tensor]) -> None:
-        """Load the weights of a policy and nothing else (`--init-from`)."""
+        """Load the weights and the normaliser of a saved policy, and nothing else (`--init-from`).
+
+        The training loop calls this before `start`.
+        """

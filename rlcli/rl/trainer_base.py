@@ -1,6 +1,6 @@
-"""Base class `BaseTrainer` of all trainers, and helpers that trainers share.
+"""Base class `BaseTrainer` of all trainers, and functions that trainers share.
 
-It keeps episode statistics and the newest observations, and makes the report of an iteration.
+The base class keeps episode statistics and the newest observations, and makes the report of an iteration.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ class BaseTrainer(ABC):
 
     Args:
         env: the environment.
-        torch_threads: threads of torch in the update. In the rollout torch has one thread, so that its thread pool does
-            not compete with the engine's.
+        torch_threads: number of threads that torch has in the update. In the rollout torch has one thread, so that its
+            thread pool does not compete with the engine's.
     """
 
     spec: PolicySpec
@@ -59,11 +59,11 @@ class BaseTrainer(ABC):
         return policy.eval().requires_grad_(False)
 
     def keep_recent_obs(self, obs: Tensor) -> None:
-        """Keep the newest observations of the policy. (num_envs, d)"""
+        """Add the policy's observations after a rollout to `recent_obs`, and drop the oldest rows. (num_envs, d)"""
         self.recent_obs = torch.cat([obs[:_RECENT_OBS], self.recent_obs])[:_RECENT_OBS]
 
     def split_seconds(self, before: Mapping[str, float], rollout: float, update: float) -> dict[str, float]:
-        """Return the duration of each part of an iteration [s].
+        """Return the durations [s] of the parts of an iteration: physics, task (terms), policy and update.
 
         Args:
             before: a copy of `env.seconds` from the beginning of the iteration.
@@ -74,7 +74,12 @@ class BaseTrainer(ABC):
         return {"physics": physics, "task": step - physics, "policy": rollout - step, "update": update}
 
     def make_report(self, losses: Mapping[str, float], seconds: dict[str, float]) -> Report:
-        """Return the report of an iteration: episode statistics, metrics of the task and losses."""
+        """Return the report of an iteration: episode statistics, metrics of the task, losses, and durations.
+
+        Args:
+            losses: metrics of the update, by name, such as `Loss/value`.
+            seconds: duration of each part of the iteration, as `split_seconds` returns them [s].
+        """
         return Report({**self.statistics.flush(), **finite_values(self.env.extras()), **losses}, seconds)
 
 
@@ -100,7 +105,7 @@ def require_library(trainer: str, needed: str, at_least: tuple[int, int], below:
 
     Args:
         trainer: name of the trainer.
-        needed: the requirement in pip's form.
+        needed: the requirement in pip's form, such as `rsl-rl-lib>=5.5,<6`.
         at_least: lowest allowed version (major, minor).
         below: lowest version (major, minor) that is too new.
 

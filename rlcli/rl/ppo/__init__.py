@@ -1,4 +1,4 @@
-"""The built-in PPO trainer: configuration, collector of rollouts, learner, networks.
+"""The built-in trainer `ppo`: settings, collection of rollouts, loss and gradient, networks.
 
-`trainer.PpoTrainer` combines them.
+`trainer.PpoTrainer` combines these modules.
 """

@@ -1,7 +1,8 @@
-"""Rollouts of the PPO trainer and their advantages.
+"""Collect the rollouts of the PPO trainer, and estimate the advantages of their samples.
 
-`collect` and `estimate_advantages` have no arguments and no results. They read and write preallocated tensors and never
-read a value back from the device, so that a GPU can capture each of them as a CUDA graph and replay it.
+The methods `collect` and `estimate_advantages` of `Collector` have no arguments and no results. They work on
+preallocated tensors and never read a value back from the device, so that a GPU can capture each of them as a CUDA graph
+and replay it.
 """
 
 from __future__ import annotations
@@ -33,7 +34,8 @@ class Collector:
         config: configuration of the agent.
         networks: actor and critic.
         statistics: statistics of finished episodes.
-        mirror: mirror maps of the task; None if the agent does not use the symmetry of the robot.
+        mirror: maps from observations and actions to their mirror images; None if the agent does not use the symmetry
+            of the robot.
     """
 
     def __init__(
@@ -48,7 +50,7 @@ class Collector:
         self.statistics, self.process_group = statistics, distributed.current()
         device, layout = env.device, env.layout
         self.iteration = 0
-        """Number of rollouts collected so far."""
+        """Number of finished iterations; the trainer increases it before the update."""
         self.checks_every_stage = device.type == "cpu"
         """Whether tensors are checked for NaN after every stage.
 
@@ -82,7 +84,7 @@ class Collector:
         self.hidden_state = {name: lstm.blank(env.num_envs) for name, lstm in networks.recurrent_modules().items()}
         """Current hidden states of the LSTMs of actor and critic. (num_envs, m) each"""
         self.initial_hidden_state = {name: state.clone() for name, state in self.hidden_state.items()}
-        """Hidden states at the beginning of the rollout."""
+        """Hidden states of the LSTMs of actor and critic at the beginning of the rollout. (num_envs, m) each"""
         self.explained_variance = torch.zeros((), device=device)
         """Explained variance of the critic: 1 - Var(target - value) / Var(target). (scalar)"""
 
@@ -90,7 +92,7 @@ class Collector:
 
     @torch.no_grad()
     def collect(self) -> None:
-        """Do `num_steps` steps in every environment with the current policy."""
+        """Do `num_steps` steps in every environment with the current policy, and store the samples in `rollout`."""
         rollout, samples, bound = self.rollout, self.rollout.samples, self.config.action_bound
         for name, state in self.hidden_state.items():
             self.initial_hidden_state[name].copy_(state)
@@ -118,7 +120,7 @@ class Collector:
         rollout.old_std.copy_(std.expand_as(rollout.old_std))
 
     def set_obs(self, obs: Mapping[str, Tensor]) -> None:
-        """Set the current observations. (num_envs, d) each"""
+        """Copy new observations, by group, into the current ones, after a reset or a rollout. (num_envs, d) each"""
         for group, own in self.obs.items():
             own.copy_(obs[group])
 
@@ -140,7 +142,10 @@ class Collector:
         return self.actor_input(obs), self._critic_input(obs)
 
     def _actor_features(self, obs: Tensor, episode_start: Tensor) -> Tensor:
-        """Return the input of the actor's MLP: the observation, or the output of the LSTM."""
+        """Return the input of the actor's MLP: the observation, or the LSTM's output for it, which advances its state.
+
+        `episode_start` is 1 where the hidden state must be zero. (num_envs, d), (num_envs,) -> (num_envs, features)
+        """
         if self.networks.memory is None:
             return obs
         state = self.hidden_state["actor"]
@@ -150,7 +155,7 @@ class Collector:
         return features
 
     def _store_outcome(self, t: int, step: StepResult) -> None:
-        """Store reward, episode end and last observation of step t, and count finished episodes."""
+        """Store rewards, ends of episodes and last observations of step t; add ended episodes to the statistics."""
         rollout = self.rollout
         torch.mul(step.reward, self.config.reward_scale, out=rollout.reward[t])
         torch.logical_or(step.terminated, step.truncated, out=rollout.done[t])
@@ -225,9 +230,9 @@ class Collector:
         return value if self.value_normalizer is None else self.value_normalizer.inverse(value)
 
     def _value_where(self, mask: Tensor, critic_obs: Tensor) -> Tensor:
-        """Return the value where the mask is set, 0 elsewhere.
+        """Return the critic's value where the mask is true, 0 elsewhere. (...), (..., c) -> (...)
 
-        A CPU computes only the masked values. A GPU computes all: to select rows it would have to synchronise.
+        On a CPU only the masked values are computed. On a GPU all are: selecting rows would force a host sync.
         """
         if self.env.device.type == "cpu":
             value = torch.zeros(mask.shape)
@@ -237,7 +242,7 @@ class Collector:
 
     @torch.no_grad()
     def complete_images(self) -> None:
-        """Compute the samples' mirror images (observation, action, value, ...), after the samples' advantages.
+        """Compute the mirror images of the samples; call it after `estimate_advantages`. Without symmetry do nothing.
 
         As in Mittal et al. 2024, a mirrored action gets the probability of the original action, because both are
         equally probable for a symmetric policy.
@@ -268,7 +273,7 @@ class Collector:
         return obs[groups[0]] if len(groups) == 1 else torch.cat([obs[group] for group in groups], dim=-1)
 
     def update_normalizers(self, obs: Mapping[str, Tensor]) -> None:
-        """Update the running statistics of the observations. (..., d) each"""
+        """Update the normalisers of the observations with the observations of each group. (..., d) each"""
         if self.normalizer is not None:
             self._update_normalizer(self.normalizer, obs["policy"].flatten(0, -2))
         if self.critic_normalizer is not None:
@@ -294,15 +299,15 @@ class Collector:
         require_finite(self.rollout.in_causal_order(), self.iteration, ("step", "environment"))
 
     def rollout_dependencies(self) -> list[tuple[str, Tensor]]:
-        """Return the named tensors that a rollout depends on: normalisers, weights and hidden states."""
+        """Return (name, tensor) of everything that a rollout depends on: normalisers, weights and hidden states."""
         states = [(f"the hidden state of the {name}", state) for name, state in self.initial_hidden_state.items()]
         return [*self.normalizer_moments(), *self.named_weights(), *states]
 
     def named_weights(self) -> list[tuple[str, Tensor]]:
-        """Return the weights with their names."""
+        """Return (name for messages, weight) of all weights of actor and critic."""
         return [(f"weight '{name}'", parameter.detach()) for name, parameter in self.networks.named_parameters()]
 
     def normalizer_moments(self) -> list[tuple[str, Tensor]]:
-        """Return the running statistics of all normalisers with their names."""
+        """Return (name for messages, tensor) of the mean, variance and count of all normalisers."""
         critic, value = ("critic's observation", self.critic_normalizer), ("value", self.value_normalizer)
         return moments([("observation", self.normalizer), critic, value])

@@ -36,7 +36,7 @@ def compile_update(
     compile_ = functools.partial(torch.compile, fullgraph=True, dynamic=False, mode=mode)
     compiled = UpdateFunctions(*map(compile_, functions))
     try:
-        with warnings.catch_warnings(action="ignore"):  # its warnings are advice for rlcli's authors
+        with warnings.catch_warnings(action="ignore"):  # the compiler's warnings are advice for rlcli's authors
             warm_up(compiled)
     except (RuntimeError, ImportError, OSError) as error:
         reason = next(iter(str(error).strip().splitlines()), "")
@@ -50,7 +50,10 @@ def compile_update(
 
 @contextlib.contextmanager
 def tf32_matmul(allowed: bool) -> Iterator[None]:
-    """Allow float32 matrix products in the block to round their factors to TF32 (10 bits of mantissa)."""
+    """Allow float32 matrix products in the `with` block to round their factors to TF32 (10 bits of mantissa).
+
+    If `allowed` is false, nothing changes.
+    """
     before = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision("high" if allowed else before)
     try:
@@ -60,9 +63,9 @@ def tf32_matmul(allowed: bool) -> Iterator[None]:
 
 
 def _use_user_cache() -> None:
-    """Set the cache folder of the compiler, unless the user has set it.
+    """Set the cache folder of the compiler (TORCHINDUCTOR_CACHE_DIR), unless the user has set the variable.
 
-    torch sets the variable to a temporary folder, `torchinductor_USER`, when it is imported.
+    torch sets the variable to a temporary folder, `torchinductor_USER`, when torch is imported.
     """
     import platformdirs
 

@@ -1,7 +1,7 @@
-"""Computation of MLP gradients by the worker processes that step the environment, which are idle between rollouts.
+"""Compute the gradients of MLPs in the worker processes that step the environments and are idle between rollouts.
 
-Python runs one thread at a time, so that more than about eight threads of one process slow each other down. A
-minibatch is split and summed as in `rlcli.rl.mlp_gradients.MlpGradients`, so the results are bit-identical.
+Python runs one thread at a time, so that more than about eight threads of one process slow each other down. A minibatch
+is split and summed as in `rlcli.rl.mlp_gradients.MlpGradients`, so the gradients have the same bits as with threads.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def distributed_gradients(
         networks: actor and critic, MLPs.
         weights: vector of all parameters of both networks. (p,)
         config: configuration of the agent.
-        rollout: buffer whose minibatches are moved to shared memory.
+        rollout: buffer whose minibatches are moved to shared memory, so that the processes can read them.
     """
     rows = max(rollout.sizes)
     actions = rollout.old_std.shape[1]
@@ -87,7 +87,7 @@ class _Job:
 
 
 class _ProcessGradients:
-    """Gradient computation of one process: of n processes, each computes every n-th part of a minibatch.
+    """Gradient computation in one of n processes, which computes every n-th part of a minibatch.
 
     Samples and gradients are in memory that all processes share.
     """
@@ -106,7 +106,7 @@ class _ProcessGradients:
         self._first, self._step = env.shard.number, env.shard.number_of_shards
 
     def compute(self, number: int) -> None:
-        """Write the gradients of this process's parts of minibatch `number`: every n-th part for n processes."""
+        """Write the gradients of this process's parts of the minibatch with index `number` to the shared memory."""
         batch, tensors = self._batches[number], self._tensors
         rows = len(batch.target)
         objective = Objective(self._config, batch, tensors["advantage"][:rows], tensors["std"], tensors["mean"][:rows])

@@ -1,7 +1,7 @@
-"""Update of the PPO trainer: several epochs of minibatches over one rollout.
+"""Update actor and critic of the PPO trainer: several epochs of minibatches over one rollout.
 
-`update` has no arguments and no result, and never reads a value back from the device, so that a GPU can capture it as a
-CUDA graph and replay it. `metrics` reads one small tensor.
+The method `update` of `Learner` has no arguments and no result, and never reads a value back from the device, so that a
+GPU can capture it as a CUDA graph and replay it. The method `metrics` reads one small tensor.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ class Learner:
     """Learner that updates actor and critic with the rollout of a collector.
 
     Args:
-        collector: the collector.
-        torch_threads: threads of the update.
+        collector: the collector of the rollouts.
+        torch_threads: number of threads of the update.
     """
 
     def __init__(self, collector: Collector, torch_threads: int) -> None:
@@ -75,9 +75,9 @@ class Learner:
             self.minibatch_gradient = AutogradGradient(self._networks, self.gradient_and_kl, self.functions.loss)
 
     def _gradient_computation(self, threads: int) -> MakeLayerGradients:
-        """Return a factory of `LayerGradients`.
+        """Return a factory of functions that compute the gradients of the layers of actor and critic.
 
-        The environment's worker processes compute them if it has several, else threads of this process do.
+        If the environment has worker processes, they compute the gradients; else threads of this process do.
         """
         env, rollout = self.collector.env, self.collector.rollout
         if env.workers > 1:
@@ -89,7 +89,7 @@ class Learner:
         return threaded_gradients(self._networks, max(rollout.sizes), threads)
 
     def update(self) -> None:
-        """Estimate the advantages, then optimise actor and critic."""
+        """Estimate the advantages of the rollout, optimise actor and critic, and store the metrics of the update."""
         collector = self.collector
         with tf32_matmul(self._tf32):
             collector.estimate_advantages()
@@ -114,7 +114,7 @@ class Learner:
         self._adapt_learning_rate(self._kl_sum / len(rollout.minibatches), "iteration")
 
     def sample_order(self) -> Tensor:
-        """Return the order in which the samples fill the minibatches."""
+        """Return the order in which the samples fill the minibatches, as indices t * num_envs + env. (samples,)"""
         shuffled, rollout = self.config.shuffle != "none", self.collector.rollout
         device = self.weights.device
         if self._networks.memory is not None:
@@ -123,7 +123,10 @@ class Learner:
         return torch.randperm(self._samples_per_rollout, device=device) if shuffled else rollout.by_environment
 
     def step(self, batch: Samples, number: int) -> None:
-        """Take one optimiser step on a minibatch."""
+        """Take one optimiser step on the minibatch `batch`, which has the index `number`.
+
+        On a CPU raise `DivergedError` if a loss, gradient or weight is not finite.
+        """
         iteration, checks = self.collector.iteration, self.collector.checks_every_stage
         result = self.compute_gradient(self.minibatch_gradient, batch, number)
         self._metric_sums += result.metrics
@@ -145,7 +148,10 @@ class Learner:
             self._kl_sum += self._minibatch_kl
 
     def compute_gradient(self, minibatch_gradient: MinibatchGradient, batch: Samples, number: int) -> LossResult:
-        """Return the loss of a minibatch, and write its gradient and its KL divergence to `gradient_and_kl`."""
+        """Return the loss of a minibatch, and write its gradient and its KL divergence to `gradient_and_kl`.
+
+        `minibatch_gradient` computes both; `number` is the index of the minibatch `batch`.
+        """
         config, old_std = self.config, self.collector.rollout.old_std[number]
         obs, critic_obs = self.network_inputs(batch, number)
         advantage = batch.advantage
@@ -154,7 +160,10 @@ class Learner:
         return minibatch_gradient(config, batch, obs, critic_obs, advantage, old_std)
 
     def network_inputs(self, batch: Samples, number: int) -> tuple[Tensor, Tensor]:
-        """Return the inputs of the MLPs: observations, or the outputs of the LSTMs unrolled over the rollout."""
+        """Return the inputs of the MLPs of actor and critic for the minibatch `batch`, which has the index `number`.
+
+        The inputs are the observations, or the outputs of the LSTMs unrolled over the rollout. (n, d), (n, c)
+        """
         if self._networks.memory is None:
             return batch.obs, batch.critic_obs
         environments = self.collector.rollout.environments[number]
@@ -220,10 +229,10 @@ class Learner:
         self._process_group.average_(self.metric_values)
 
     def metrics(self) -> dict[str, float]:
-        """Return the metrics of the last update.
+        """Return the metrics of the last update, by name; metrics that are not finite are left out.
 
         Raises:
-            DivergedError: if the learner diverged, with the first tensor that is not finite.
+            DivergedError: if a weight, normaliser or loss is not finite, with the first such tensor.
         """
         *losses, std, learning_rate, all_finite, explained = self.metric_values.tolist()
         metrics = {f"Loss/{name}": value for name, value in zip(METRICS, losses, strict=True)}
@@ -245,7 +254,7 @@ class Learner:
     def _gradient_in_causal_order(self, result: LossResult) -> list[tuple[str, Tensor]]:
         """Return (name, tensor) of losses, then of gradients in the order of the backward pass.
 
-        The first of them that is not finite is the cause of a divergence.
+        If the learner diverges, the first tensor that is not finite is the cause.
         """
         losses = [(f"the loss ({name})", result.metrics[i]) for i, name in enumerate(METRICS) if i != KL]
         names, parameters = zip(*self._networks.named_parameters(), strict=True)

@@ -1,6 +1,6 @@
 """Loss of PPO, gradient clipping and adaptive learning rate, as functions of tensors.
 
-On a GPU torch's compiler may fuse them (`rlcli.rl.ppo.compile`); a CPU runs them uncompiled by default.
+On a GPU torch's compiler may fuse these functions (`rlcli.rl.ppo.compile`); on a CPU they run uncompiled by default.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class LossResult(NamedTuple):
     loss: Tensor
     """Loss that the optimiser minimises. (scalar)"""
     metrics: Tensor
-    """`METRICS`, detached. (7,)"""
+    """Values of `METRICS`, detached. (7,)"""
     mean: Tensor
     """Mean actions, detached. (n, a)"""
     std: Tensor
@@ -130,7 +130,7 @@ class UpdateFunctions(NamedTuple):
 
 
 def standardize(values: Tensor, process_group: ProcessGroup) -> Tensor:
-    """Return (values - mean) / std, with mean and unbiased std over the values of all processes."""
+    """Return (values - mean) / std, with mean and unbiased std over the elements of all processes. (...) -> (...)"""
     deviation = values - process_group.average_(values.mean())
     count = values.numel() * process_group.world_size
     variance = process_group.average_(deviation.square().mean()) * (count / (count - 1))
@@ -168,7 +168,7 @@ def _clipped_standard_score(values: Tensor) -> Tensor:
 
 
 def _value_loss(value: Tensor, batch: Samples, config: PpoConfig) -> Tensor:
-    """Return the mean squared error of the value.
+    """Return the value loss: the mean squared error of the critic's values (n,) for a minibatch. (scalar)
 
     With `clip_value` the change of the value is clipped, as in OpenAI Baselines:
 

@@ -1,6 +1,7 @@
 """Gradient of a minibatch's loss: by autograd, or in closed form, which is faster for MLPs on a CPU.
 
-Both have the same arguments and write the same vector: the gradient of all parameters, followed by the KL divergence.
+Both computations have the same arguments and write the same vector: the gradient of all parameters, followed by the KL
+divergence.
 
 The closed form differentiates the loss of `rlcli.rl.ppo.loss.minibatch_loss` (equations 7 and 9 of Schulman et al.
 2017) with respect to the networks' outputs. With z = (a - mean) / std, n samples and the ratio r:
@@ -40,8 +41,15 @@ class LayerGradients(Protocol):
     """Function that computes the gradients of the layers of actor and critic for a minibatch."""
 
     def __call__(self, obs: Tensor, critic_obs: Tensor, objective: Objective) -> tuple[Tensor, Tensor]:
-        """Write the gradients; return the statistics of `Objective.mean_gradient` and `value_gradient`, summed over all
-        samples. Inputs (n, d), (n, c)
+        """Write the gradients of all layers.
+
+        Args:
+            obs: inputs of the actor. (n, d)
+            critic_obs: inputs of the critic. (n, c)
+            objective: the loss as a function of the networks' outputs.
+
+        Returns:
+            The statistics of `Objective.mean_gradient`, (3 + 2 a,), and `value_gradient`, (), summed over all samples.
         """
 
 
@@ -50,7 +58,13 @@ MakeLayerGradients = Callable[[Sequence[Tensor]], LayerGradients]
 
 
 def threaded_gradients(networks: ActorCritic, rows: int, threads: int) -> MakeLayerGradients:
-    """Return a factory of functions (`LayerGradients`) that compute gradients in threads of this process."""
+    """Return a factory of functions (`LayerGradients`) that compute gradients in threads of this process.
+
+    Args:
+        networks: actor and critic, MLPs.
+        rows: number of samples of the largest minibatch.
+        threads: number of threads.
+    """
 
     def make(gradients: Sequence[Tensor]) -> LayerGradients:
         mlps = MlpGradients(networks.actor, networks.critic, gradients, rows, threads)
@@ -150,10 +164,14 @@ class Objective:
         self._mean_scale = 1.0 / (std * len(advantage))
 
     def mean_gradient(self, rows: slice, mean: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the gradient of the loss with respect to the actor's outputs, and statistics that are added up.
+        """Return the gradient of the loss with respect to the actor's outputs, (n, a), and statistics, (3 + 2 a,).
 
-        The statistics are surrogate, number of clipped ratios, bounds loss, (3,); gradients of the log std, (a,);
-        and squared distances between old and new mean, (a,). See `rlcli.rl.mlp_gradients.OutputGradient`.
+        The statistics are sums over the samples: surrogate, number of clipped ratios and bounds loss, (3,); gradients
+        of the log std, (a,); squared distances between old and new mean, (a,).
+
+        Args:
+            rows: which samples of the minibatch, a part of it.
+            mean: outputs of the actor for these samples. (n, a)
         """
         config, batch = self._config, self.batch
         self.mean[rows] = mean
@@ -169,7 +187,12 @@ class Objective:
         return gradient, torch.cat((torch.stack((surrogate, clipped, bounds)), log_std_gradient, distance))
 
     def value_gradient(self, rows: slice, value: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the gradient of the loss with respect to the critic's outputs, and the sum of the squared errors."""
+        """Return the gradient of the loss with respect to the critic's outputs, (n, 1), and the sum of squared errors.
+
+        Args:
+            rows: which samples of the minibatch, a part of it.
+            value: outputs of the critic for these samples. (n, 1)
+        """
         config, value, old_value = self._config, value.squeeze(-1), self.batch.value[rows]
         error = value - self.batch.target[rows]
         if config.clip_value is None:
@@ -189,7 +212,12 @@ class Objective:
         return gradient.mul_(2.0 * config.value_coef / len(self.advantage))[:, None], square.sum()
 
     def _surrogate(self, rows: slice, noise: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return the surrogate loss (equation 7), the number of clipped ratios, and dL/dlog pi and dL/dlog std."""
+        """Return the surrogate loss (equation 7), the number of clipped ratios, dL/dlog pi (n,) and dL/dlog std (a,).
+
+        Args:
+            rows: which samples of the minibatch, a part of it.
+            noise: (action - mean) / std of these samples. (n, a)
+        """
         limit, advantage, square = self._config.clip_range, self.advantage[rows], noise.square()
         ratio = (log_prob(noise, self.std) - self.batch.log_prob[rows]).exp_()
         within = ratio.clamp(1.0 - limit, 1.0 + limit)

@@ -1,6 +1,6 @@
-"""Actor and critic networks of the PPO trainer, in float32, and helpers that create and initialise them.
+"""Actor and critic networks of the PPO trainer, in float32, and functions that create and initialise them.
 
-All parameters are in one vector and all gradients in another, so that one operation processes all.
+All parameters are in one vector and all gradients in another, so that one operation updates all parameters.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class ActorCritic(nn.Module):
         env: the environment, which defines the columns of observations and actions.
         config: configuration of networks, initial weights and standard deviation.
         groups: observation groups of the critic.
-        mirror: mirror map of the action; None if the agent does not use the symmetry of the robot.
+        mirror: map from an action to its mirror image; None if the agent does not use the symmetry of the robot.
     """
 
     mirror_index: Tensor | None
@@ -89,6 +89,8 @@ class ActorCritic(nn.Module):
     def mirror_error(self, mean: Tensor) -> Tensor:
         """Return the mean squared difference between mean actions for mirrored observations and mirrored mean actions.
 
+        The result is a scalar; 0 if the agent does not use the symmetry of the robot.
+
         Args:
             mean: mean actions for n / 2 observations, then for their mirror images. (n, a)
         """
@@ -108,7 +110,7 @@ class ActorCritic(nn.Module):
         return value
 
     def recurrent_modules(self) -> dict[str, Lstm]:
-        """Return the LSTMs of actor and critic; an empty mapping for MLPs."""
+        """Return the LSTMs, by `actor` and `critic`; an empty dict if the agent has no RNN."""
         modules = {"actor": self.memory, "critic": self.critic_memory}
         return {name: module for name, module in modules.items() if module is not None}
 
@@ -150,7 +152,10 @@ def unroll(lstm: Lstm, obs: Tensor, episode_start: Tensor, state: Tensor) -> tup
 
 
 class ValueNormalizer(Normalizer):
-    """Running mean and variance of returns, starting from a count of 1 with mean 0 and variance 1."""
+    """Normaliser of discounted returns by their running mean and variance.
+
+    The statistics start from a count of 1 with mean 0 and variance 1, as in rl_games.
+    """
 
     def __init__(self) -> None:
         super().__init__(())
@@ -173,8 +178,8 @@ def flatten(module: nn.Module) -> tuple[nn.Parameter, Tensor, dict[str, slice]]:
     """Replace a module's parameters by views of one vector.
 
     Returns:
-        The vector, (p,); its gradient followed by a place for the minibatch's KL divergence, (p + 1,), so that one call
-        averages both over the ranks; and the slice of each parameter.
+        The vector, (p,); its gradient followed by one element for the minibatch's KL divergence, (p + 1,), so that one
+        call averages both over the ranks; and the slice of each parameter in the vector, by name.
     """
     parameters = dict(module.named_parameters())
     vector = nn.Parameter(torch.cat([value.detach().flatten() for value in parameters.values()]))
@@ -205,7 +210,7 @@ def _mlp(inputs: int, config: NetworkConfig, outputs: int, init: str, gain: floa
 
 
 def _make_cnn(spec: CnnSpec | None, columns: int, config: NetworkConfig, init: str) -> tuple[Cnn | None, int]:
-    """Return the CNN, or None without images, and the number of columns that the MLP behind it reads."""
+    """Return the CNN and the number of columns that the MLP behind the CNN reads; without images None and `columns`."""
     if spec is None:
         return None, columns
     vision = Cnn(spec, ACTIVATIONS[config.activation])
@@ -216,12 +221,15 @@ def _make_cnn(spec: CnnSpec | None, columns: int, config: NetworkConfig, init: s
 
 
 def _activation(name: str) -> nn.Module:
-    """Return an activation; it works in place if its gradient needs only its output."""
+    """Return the activation of a name; it works in place if its gradient can be computed from its output."""
     return ACTIVATIONS[name](inplace=True) if name in ("elu", "relu") else ACTIVATIONS[name]()
 
 
 def _initialize(layer: nn.Linear | nn.Conv2d, init: str, gain: float) -> nn.Module:
-    """Set the initial weights that the setting `init` demands (`default`: torch's); return the layer."""
+    """Set the initial weights of a layer by the setting `init` (`PpoConfig.init`); return the layer.
+
+    `gain` is the gain of orthogonal weights.
+    """
     if init == "orthogonal":
         nn.init.orthogonal_(layer.weight, gain)
     if init != "default":

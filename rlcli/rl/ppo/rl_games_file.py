@@ -1,7 +1,7 @@
-"""Translation of an rl_games configuration (its mapping `params`) into settings of the trainer `ppo`.
+"""Translate an rl_games configuration (its mapping `params`) into settings of the trainer `ppo`.
 
-Isaac Lab and OmniIsaacGymEnvs have such configurations. Settings that the file does not mention get the defaults of
-rl_games, through the setting `dialect: rl_games`. The module does not import torch.
+Tasks of Isaac Lab and OmniIsaacGymEnvs have such configurations. Settings that the file does not mention get the
+defaults of rl_games, through the setting `dialect: rl_games`. The module does not import torch.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ class Sink(Protocol):
     """
 
     def put(self, target: Path, value: Any, source: Path, /) -> None:
-        """Set a setting of `ppo`."""
+        """Store the value of the key `target` of `ppo`, which comes from the place `source` in the file."""
 
     def note(self, path: Path, status: Status, text: str = "", /) -> None:
-        """Record how a key was translated."""
+        """Record how the key at the place `path` was translated: exactly, approximately, or not at all."""
 
     def problem(self, path: Path, message: str, hint: str | None = None, /) -> None:
-        """Record a mistake."""
+        """Record a mistake at the place `path`: what is wrong, and as the hint what to do."""
 
 
 _KEYS = load(pathlib.Path(__file__).with_name("rl_games_keys.yaml").read_bytes()).data
@@ -57,7 +57,7 @@ class RlGamesReader:
 
     Args:
         sink: receives the settings, notes and mistakes.
-        is_strict: whether a key that rl_games does not have is a mistake; otherwise it is noted as ignored.
+        is_strict: whether a key that rl_games does not have is a mistake; if not, the key is noted as ignored.
     """
 
     def __init__(self, sink: Sink, *, is_strict: bool) -> None:
@@ -80,7 +80,7 @@ class RlGamesReader:
 
     def _report_unknown_key(self, at: Path, hint: str | None = None) -> None:
         if self._is_strict:
-            self.problem(at, f"unknown key '{at[-1]}'", hint or "remove it")
+            self.problem(at, f"unknown key '{at[-1]}'", hint or "remove the key")
         else:
             self.note(at, "ignored", "rlcli has no such setting")
 
@@ -229,7 +229,7 @@ class RlGamesReader:
         at = ("params", "config")
         for key in _REQUIRED:
             if config.get(key) is None:
-                self.problem(at, f"missing '{key}'; give it a value")
+                self.problem(at, f"missing '{key}'; add the key with a value")
         for key, value in config.items():
             if key in _DIRECT:
                 self.put((_DIRECT[key],), value, (*at, key))
@@ -295,7 +295,7 @@ class RlGamesReader:
 
 
 def _no_counterpart(value: object) -> str:
-    """Return the note for an rl_games setting that has no value or a value that rlcli cannot represent."""
+    """Return the message for an rl_games setting that has no value, or a value without a counterpart in rlcli."""
     return "the key has no value" if value is None else f"'{value}' has no counterpart in rlcli"
 
 

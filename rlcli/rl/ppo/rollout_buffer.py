@@ -1,7 +1,4 @@
-"""Buffer of a rollout's samples, allocated once on the device and written in place.
-
-It also orders the samples into minibatches.
-"""
+"""Buffer of a rollout's samples, allocated once on the device and written in place; it also makes the minibatches."""
 
 from __future__ import annotations
 
@@ -16,7 +13,7 @@ from rlcli.sim.state_cache import is_finite
 
 @dataclass(frozen=True, slots=True)
 class Samples:
-    """Samples of a rollout. All fields are columns of one packed tensor. (..., d) or (...)
+    """Samples of a rollout or a minibatch. All fields are columns of one packed tensor. (..., d) or (...)
 
     One gather operation on the packed tensor therefore fills a minibatch.
     """
@@ -30,7 +27,9 @@ class Samples:
     mean: Tensor
     """Mean of the distribution that the action was sampled from."""
     log_prob: Tensor
+    """Log-probability density of the action."""
     value: Tensor
+    """The critic's value of the observation, normalised if the agent normalises values."""
     advantage: Tensor
     target: Tensor
     """Regression target of the critic: advantage + value."""
@@ -52,7 +51,7 @@ class Samples:
         return cls(parts[0], parts[1] if critic_obs else parts[0], parts[2], parts[3], *scalars)
 
     def first_half(self) -> Samples:
-        """Return the first half of the samples of a minibatch, without their mirror images."""
+        """Return the first half of a minibatch, without the second half, which has the mirror images of the samples."""
         return Samples(*(getattr(self, each.name).chunk(2)[0] for each in fields(self)))
 
 
@@ -67,6 +66,9 @@ class RolloutBuffer:
         whole_envs: whether a minibatch holds all steps of its environments.
         device: device of all tensors.
         mirrored: whether each minibatch also holds the mirror images of its samples, after all samples.
+
+    Raises:
+        MachineError: if the CPU's memory is too small for the buffer.
     """
 
     def __init__(
@@ -97,20 +99,23 @@ class RolloutBuffer:
         """Standard deviation of the old policy, for each minibatch; its mean is `Samples.mean`. (minibatches, a)"""
         self.reward = torch.zeros(steps, envs, device=device)
         self.done = torch.zeros(steps, envs, device=device)
-        """1 where the step ended the episode by termination or truncation, 0 elsewhere."""
+        """1 where the step ended the episode by termination or truncation, 0 elsewhere. (num_steps, num_envs)"""
         self.time_out = torch.zeros(steps, envs, dtype=torch.bool, device=device)
-        """True where the episode was truncated and not terminated."""
+        """True where the episode was truncated and not terminated. (num_steps, num_envs)"""
         self.final_obs = torch.zeros(steps, envs, critic_obs or obs, device=device)
-        """Normalised last observation of the episode for the critic; valid only at time-outs."""
+        """Normalised last observation of the episode for the critic. (num_steps, num_envs, c)
+
+        Valid only where `time_out` is true.
+        """
         self._indices = torch.arange(steps * envs, device=device).view(steps, envs)
         self.by_environment = self._indices.T.flatten()
-        """Order of samples that puts the steps of each environment one after the other."""
+        """Indices of the samples, all steps of the first environment first, then all of the second, ... (samples,)"""
         parts = self._indices[0].split_with_sizes([size // steps for size in minibatches]) if whole_envs else ()
         self.environments = [part.clone() for part in parts]
         """Environments of each minibatch; empty without `whole_envs`. (n,) each"""
 
     def move(self, memory: Tensor) -> None:
-        """Store the minibatches one after the other in `memory`. (samples of all minibatches, columns)"""
+        """Use `memory` for the minibatches, one after the other. (samples of all minibatches, columns)"""
         self.ordered = memory
         self.minibatches = [Samples.views(part, *self.columns) for part in memory.split_with_sizes(self.sizes)]
         """Samples of each minibatch, views of `ordered`. (n, ...) each"""
@@ -150,7 +155,10 @@ class RolloutBuffer:
         return torch.cat([self._indices.index_select(1, part).flatten() for part in parts])
 
     def fill_minibatches(self, order: Tensor) -> None:
-        """Copy the samples into the minibatches in the given order; sample (t, env) has index t * num_envs + env."""
+        """Copy the samples into the minibatches in the given order, with their mirror images if there are any.
+
+        `order` has the indices of the samples; the sample of environment env in step t has index t * num_envs + env.
+        """
         if self.images is not None:
             parts = order.split_with_sizes(self._samples_of_minibatches)
             order = torch.cat([torch.cat((part, part + len(order))) for part in parts])

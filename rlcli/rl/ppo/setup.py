@@ -1,6 +1,6 @@
-"""Functions that derive the parts of the PPO trainer from its settings and the environment.
+"""Derive the structure of policy and CNN, the critic's observation groups and minibatch sizes of the PPO trainer.
 
-The parts are the structure of policy and CNN, the observation groups of the critic, and the minibatch sizes.
+The functions check the trainer's settings against the environment.
 """
 
 from __future__ import annotations
@@ -25,7 +25,11 @@ It is measured in docs/explanation/benchmarks.md.
 
 
 def policy_spec(env: Environment, config: PpoConfig) -> PolicySpec:
-    """Return the structure of the trained policy."""
+    """Return the structure of the policy that is trained.
+
+    Raises:
+        ConfigError: if the agent has a CNN, but no observation term of the policy is an image.
+    """
     vision = cnn_spec(env, config, ("policy",))
     if config.cnn is not None and vision is None:
         message = "no term of the observation group 'policy' is an image"
@@ -68,10 +72,10 @@ def cnn_spec(env: Environment, config: PpoConfig, groups: tuple[str, ...]) -> Cn
 
 
 def critic_groups(env: Environment, config: PpoConfig) -> tuple[str, ...]:
-    """Return the observation groups of the critic.
+    """Return the names of the critic's observation groups: `critic_obs`, or `critic` if the task has it, else `policy`.
 
     Raises:
-        ConfigError: if the task has no such group.
+        ConfigError: if the task does not have a group of `critic_obs`.
     """
     available = env.layout.observations
     groups = config.critic_obs or (("critic",) if "critic" in available else ("policy",))
@@ -83,10 +87,12 @@ def critic_groups(env: Environment, config: PpoConfig) -> tuple[str, ...]:
 
 
 def task_mirror(env: Environment, config: PpoConfig) -> MirrorMaps | None:
-    """Return the mirror maps of the task on the environment's device; None if the agent uses no symmetry.
+    """Return the maps from observations and actions to their mirror images, on the environment's device.
+
+    Return None if the agent does not use the symmetry of the robot.
 
     Raises:
-        ConfigError: if the task is not symmetric.
+        ConfigError: if the robot, a reward or an observation of the task is not symmetric.
     """
     if config.symmetry is None:
         return None
@@ -100,7 +106,7 @@ def minibatch_sizes(env: Environment, config: PpoConfig, total: int) -> list[int
     """Return the number of samples of each minibatch of a rollout of `total` samples.
 
     Raises:
-        ConfigError: if the rollout has too few samples.
+        ConfigError: if the rollout has too few samples for the minibatches or for normalised advantages.
     """
     rollout = f"a rollout holds num_steps x num_envs = {config.num_steps} x {env.num_envs} = {total} samples"
     whole = config.num_steps if config.rnn else 1  # number of samples that must stay in one minibatch
@@ -121,7 +127,10 @@ def minibatch_sizes(env: Environment, config: PpoConfig, total: int) -> list[int
 
 
 def compile_mode(config: PpoConfig, device: torch.device, steps_per_iteration: int) -> bool | str:
-    """Return `compile` of the configuration; if it is null, whether the device is a GPU and the run long enough."""
+    """Return whether updates are compiled: True, False or `tuned` (`PpoConfig.compile`).
+
+    If the setting is null, updates are compiled on a GPU in runs with at least `_WORTH_COMPILING` minibatch updates.
+    """
     if config.compile is not None or device.type != "cuda":
         return config.compile or False
     iterations = config.max_iterations or math.inf

@@ -75,7 +75,11 @@ class PpoTrainer(BaseTrainer):
         self.keep_recent_obs(self.collector.obs["policy"])
 
     def iterate(self) -> Report:
-        """Collect a rollout, then update."""
+        """Collect a rollout, update actor and critic, and return metrics and durations.
+
+        Raises:
+            DivergedError: if a tensor is not finite, with the first such tensor.
+        """
         before, begin = dict(self.env.seconds), time.perf_counter()
         torch.set_num_threads(1)
         try:
@@ -107,7 +111,7 @@ class PpoTrainer(BaseTrainer):
         return self.make_report(losses, seconds)
 
     def _timestamp(self) -> Any:
-        """Return the time [s]; on a GPU a CUDA event in the current stream, which forces no host sync."""
+        """Return the time [s] as a float; on a GPU a CUDA event in the current stream, which forces no host sync."""
         if self.device.type != "cuda":
             return time.perf_counter()
         event = torch.cuda.Event(enable_timing=True)  # type: ignore[no-untyped-call]  # torch has no type here
@@ -176,7 +180,7 @@ class PpoTrainer(BaseTrainer):
             torch.cuda.set_rng_state(rng["cuda"], self.device)
 
     def load_weights(self, policy: Mapping[str, Tensor]) -> None:
-        """Load the weights and the normaliser of a policy; the critic does not change."""
+        """Load the weights and the normaliser of a saved policy (`--init-from`); the critic does not change."""
         self.networks.load_policy_tensors(policy)
         if self.collector.normalizer is not None:
             self.collector.normalizer.load_state_dict(below(policy, "normalizer."))
@@ -187,7 +191,7 @@ class PpoTrainer(BaseTrainer):
         return _copies({**self.networks.policy_tensors(), **normalizer})
 
     def _learner_tensors(self) -> dict[str, Tensor]:
-        """Return the tensors of the learner, not copied, by their names in a checkpoint; without the policy."""
+        """Return tensors of critic, normalisers and optimiser, not copied, by their names in a checkpoint."""
         tensors: dict[str, Tensor] = {
             name: value
             for name, value in self.networks.named_parameters()
@@ -200,7 +204,7 @@ class PpoTrainer(BaseTrainer):
         return {**tensors, **optimizer, "learning_rate": self.learner.learning_rate}
 
     def _episode_tensors(self) -> dict[str, Tensor]:
-        """Return the tensors that the collector keeps between rollouts, not copied, by their names in a checkpoint."""
+        """Return starts of episodes and hidden states between rollouts, not copied, by their names in a checkpoint."""
         states = {f"memory.{name}": value for name, value in self.collector.hidden_state.items()}
         return {"begins": self.collector.episode_start, **states}
 

@@ -1,4 +1,4 @@
 """The trainer `sb3`, which trains with the algorithms of Stable-Baselines3 (PPO, A2C, SAC, TD3, DDPG).
 
-Rollouts stay in torch; the updates are those of Stable-Baselines3.
+The updates are those of Stable-Baselines3; rollouts are stored as torch tensors, without copies to numpy.
 """

@@ -1,6 +1,6 @@
-"""Rollout and replay buffers for Stable-Baselines3's algorithms that store torch tensors.
+"""Rollout and replay buffers for Stable-Baselines3's algorithms, stored as torch tensors.
 
-SB3's own buffers store numpy arrays, so that each sample would be copied twice.
+SB3's own buffers store numpy arrays; with them each sample would be copied twice.
 """
 
 from __future__ import annotations
@@ -66,7 +66,10 @@ class TorchRolloutBuffer(RolloutBuffer):
         torch.add(self.advantage, self.value, out=self.target)
 
     def get(self, batch_size: int | None = None) -> Iterator[RolloutBufferSamples]:  # type: ignore[override]
-        """Shuffle the samples and yield the minibatches."""
+        """Shuffle the samples of the rollout and yield the minibatches.
+
+        `batch_size` is the number of samples of a minibatch, None: all samples; not used if `num_minibatches` is set.
+        """
         total = self.buffer_size * self.n_envs
         storage = (self.obs, self.action, self.value, self.log_prob, self.advantage, self.target)
         columns = [tensor.view(total, *tensor.shape[2:]) for tensor in storage]
@@ -83,6 +86,7 @@ class TorchReplayBuffer(ReplayBuffer):
     """
 
     normalizer: Normalizer | None = None
+    """Normaliser of the observations; None: observations are not normalised. The trainer sets it."""
 
     def __init__(self, buffer_size: int, *args: Any, **kwargs: Any) -> None:
         super().__init__(1, *args, **kwargs)  # SB3's own storage has one row: it is not used
@@ -116,7 +120,7 @@ class TorchReplayBuffer(ReplayBuffer):
         return ReplayBufferSamples(obs, action, next_obs, done, reward)
 
     def rows(self, at_risk: int) -> Rows:
-        """Return the stored rows for a checkpoint.
+        """Return the stored rows for a checkpoint, which may read them while the training goes on.
 
         Args:
             at_risk: number of steps that the training may store before the checkpoint reads the rows. The rows that

@@ -1,7 +1,4 @@
-"""Functions that create SB3's algorithm object, and the structure of its policy, from settings and an environment.
-
-`Sb3Trainer` calls them when it is created.
-"""
+"""Create the algorithm object of Stable-Baselines3 (SB3), and the structure of its policy, from an agent's settings."""
 
 from __future__ import annotations
 
@@ -30,7 +27,7 @@ _ALGORITHMS: dict[str, tuple[type, str, set[str]]] = {
 
 
 def policy_spec(env: Environment, config: Sb3Config) -> PolicySpec:
-    """Return the structure of the trained policy."""
+    """Return the structure of the policy that is trained."""
     return PolicySpec(
         kind=_ALGORITHMS[config.algorithm][1],  # type: ignore[arg-type]
         observation_size=env.layout.size("policy"),
@@ -43,7 +40,7 @@ def policy_spec(env: Environment, config: Sb3Config) -> PolicySpec:
 
 
 def make_model(env: Environment, config: Sb3Config, seed: int, device: str) -> Any:
-    """Return SB3's algorithm.
+    """Return the algorithm object of SB3, such as `PPO`, with rlcli's buffers and adapter of the environment.
 
     Raises:
         ConfigError: if a rollout is too small for its minibatches.

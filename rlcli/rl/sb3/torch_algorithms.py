@@ -48,7 +48,10 @@ class _OnPolicy(_Collecting):
     _last_episode_starts: Any
 
     def collect_rollouts(self, env: object, callback: object, rollout_buffer: object, n_rollout_steps: int) -> bool:
-        """Fill the buffer with `n_rollout_steps` steps of every environment; see SB3's `collect_rollouts`."""
+        """Fill this object's rollout buffer with `n_rollout_steps` steps of every environment; return True.
+
+        The arguments are those of SB3's method; the other ones are not used.
+        """
         buffer, source, policy, bound = self.rollout_buffer, self.source, self.policy, self.action_bound
         policy.set_training_mode(False)
         buffer.reset()

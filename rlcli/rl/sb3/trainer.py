@@ -1,6 +1,6 @@
-"""Trainer that drives an algorithm of Stable-Baselines3 one iteration at a time.
+"""Trainer that calls an algorithm of Stable-Baselines3 (SB3) for one iteration at a time.
 
-It saves and restores the whole state of the algorithm, so that a run can be resumed exactly.
+The trainer saves and restores the whole state of the algorithm, so that a run can be resumed exactly.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Sb3Trainer(BaseTrainer):
         env: the environment.
         config: configuration of the agent.
         seed: seed of the initial weights and of exploration.
-        device: cpu.
+        device: device of the networks, always `cpu`.
         torch_threads: threads of torch in the update; see `BaseTrainer`.
     """
 
@@ -96,7 +96,11 @@ class Sb3Trainer(BaseTrainer):
         self.keep_recent_obs(obs)
 
     def iterate(self) -> Report:
-        """Collect experience, then update."""
+        """Collect experience, update the networks, and return metrics and durations.
+
+        Raises:
+            DivergedError: if a tensor is not finite, with the first such tensor.
+        """
         try:
             return self._iterate()
         except ValueError as error:
@@ -287,7 +291,10 @@ class Sb3Trainer(BaseTrainer):
 
 
 def actor_names(config: Sb3Config, weights: Iterable[str]) -> dict[str, str]:
-    """Map SB3's names of the actor's weights to their names in a saved policy."""
+    """Return SB3's name of each weight of the actor -> its name in a saved policy.
+
+    `weights` are the names of all weights of SB3's policy.
+    """
     output = f"actor.{2 * len(config.policy.hidden)}."  # each hidden layer is followed by an activation
     prefixes = {
         "sac": {"actor.latent_pi.": "actor.", "actor.mu.": output, "actor.log_std.": "log_std_head."},

@@ -1,6 +1,6 @@
-"""Adapter that gives a `VecEnv` the interface of Stable-Baselines3's environments.
+"""Adapter that gives rlcli's environments the interface of Stable-Baselines3's (SB3's) `VecEnv`.
 
-The trainer `sb3` passes it to the constructors of SB3's algorithms; `rlcli.adapters.sb3` returns it to scripts.
+The trainer `sb3` passes the adapter to SB3's algorithms; `rlcli.adapters.sb3` returns it to scripts.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ UNBOUNDED = 1e6
 
 
 class Sb3VecEnv(Sb3Base):
-    """SB3 environment for the observation group `policy` of a `VecEnv`: numpy arrays, one info dict per environment.
+    """SB3 `VecEnv` with the observation group `policy` of rlcli's environments on a CPU; arrays are numpy, float32.
 
     Args:
         env: the environment.
@@ -40,7 +40,10 @@ class Sb3VecEnv(Sb3Base):
         self._action = torch.zeros(env.num_envs, env.layout.action_size)
 
     def reset(self) -> np.ndarray:
-        """Start new episodes in all environments; use a seed set by `seed` once. (num_envs, d)"""
+        """Start new episodes in all environments; return the observations. (num_envs, d) float32
+
+        If `seed` was called, the episodes start from that seed; a later reset does not use it again.
+        """
         seed = self._seeds[0]
         self._reset_seeds()
         return self.env.reset(seed=seed)["policy"].numpy()
@@ -50,7 +53,12 @@ class Sb3VecEnv(Sb3Base):
         self._action = torch.as_tensor(actions, dtype=torch.float32)
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """Step with the stored actions; see SB3's `VecEnv.step`."""
+        """Step all environments with the actions of `step_async`.
+
+        Returns:
+            Observations (num_envs, d) and rewards (num_envs,) float32, dones (num_envs,) bool, and one info dict for
+            each environment, with SB3's keys (`terminal_observation`, `TimeLimit.truncated`, ...) if its episode ended.
+        """
         result = self.env.step(self._action)
         dones = (result.terminated | result.truncated).numpy()
         return result.obs["policy"].numpy(), result.reward.numpy(), dones, self._infos(result)

@@ -110,7 +110,7 @@ def test_replay_with_changed_model_differs(trained, cli):
     model.write_text(model.read_text().replace('type="slide"', 'type="slide" stiffness="10" springref="1"'))
     shown = cli("replay", files(trained)[0], "--json")
     assert (shown.code, shown.json["equal"], shown.json["same_model"]) == (9, False, False)
-    assert "the installed task's model differs from the one in training" in cli("autopsy", trained, "0").err
+    assert "the model of the installed task differs from the model in training" in cli("autopsy", trained, "0").err
 
 
 def test_unknown_case_is_usage_error(trained, cli):

@@ -83,7 +83,7 @@ def test_settings():
 
 @pytest.mark.parametrize("key", ["gamma", "tau", "learning_rate", "horizon_length", "minibatch_size", "max_epochs"])
 def test_missing_setting(key):
-    assert read(**{f"config__{key}": None}).problems == {"params.config": f"missing '{key}'; give it a value"}
+    assert read(**{f"config__{key}": None}).problems == {"params.config": f"missing '{key}'; add the key with a value"}
 
 
 def test_unknown_keys_are_mistakes_or_noted():
