@@ -290,10 +290,12 @@ def truncation(subject: TaskUnderTest) -> Iterator[Finding]:
     if early[0] and early[0] == early[1] and len(early[0]) == 1:
         count = early[0].pop()
         steps = f"{count} step{'s' if count > 1 else ''}"
-        message = f"every episode is truncated {steps} before its limit; it must be truncated at its limit"
-        if subject.resolved.format is not None:
-            hint = "compare the step with `>= max_episode_length`, not with `>= max_episode_length - 1`"
-        yield error_at("terminations", message, hint)
+        message = f"every episode is truncated {steps} before its limit"
+        if count == 1 and subject.resolved.format is not None:
+            hint = "usual in the task's framework; for the full length compare the step with `>= max_episode_length`"
+            yield warning_at("terminations", message, hint)
+        else:
+            yield error_at("terminations", f"{message}; it must be truncated at its limit", hint)
     elif any(early):
         message = "some episodes are truncated before their limit"
         yield warning_at("terminations", message, "use `time_out: true` only for ends that do not depend on the state")

@@ -28,7 +28,7 @@ URDF = """<robot name="arm"><!-- options -->
 </robot>
 """
 PAGE = page_path("first-task.md")
-SHORT, LINE, FREE = (block for block in all_blocks(PAGE, "### Convert a URDF", "### Start from an MJCF"))
+SHORT, LINE, FREE = (block for block in all_blocks(PAGE, "### Convert a URDF"))
 
 
 @pytest.fixture

@@ -93,7 +93,7 @@ def test_scenes_of_page_build_and_run(number, tmp_path):
 
 
 def test_sections_of_task_page_work_together(tmp_path):
-    found = blocks(page_path("first-task.md"), "## Observations", "## Check it")
+    found = blocks(page_path("first-task.md"), "## Observations", "## Start from your own robot")
     parts = [yaml.safe_load(block.text) for block in found if block.language == "yaml"]
     (terms,) = [block.text for block in found if block.language == "python"]
     assert [list(part) for part in parts] == [
