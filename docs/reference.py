@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import importlib
 import inspect
-import json
 import re
 import tomllib
 from collections.abc import Iterable, Iterator
@@ -16,6 +15,17 @@ from pathlib import Path
 from typing import Any
 
 import griffe
+from reference_python import (
+    MODULES,
+    cell,
+    docstring_parts,
+    file_name,
+    one_line,
+    public_names,
+    python_index,
+    python_page,
+    slug,
+)
 
 from rlcli.config.term_docs import TermEntry, term_entries, type_text, yaml_text
 
@@ -24,44 +34,6 @@ PUBLIC = DOCS / "public-names.txt"
 """Public Python names, one a line; tests/docs compares them with the code."""
 WORDS = DOCS / "public-words.txt"
 """Public words of task files and command lines; tests/packaging compares them with the code."""
-MODULES = {
-    "rlcli.task": "Task plugins and type aliases of terms",
-    "rlcli.trainers": "Trainer plugins",
-    "rlcli.formats": "Plugins that read other task formats",
-    "rlcli.errors": "Exceptions",
-    "rlcli.gym": "Gymnasium registration",
-    "rlcli.random": "Seeds",
-    "rlcli.registry": "Find tasks and trainers",
-    "rlcli.config.load": "Resolve a configuration",
-    "rlcli.config.schema": "Configuration models",
-    "rlcli.reporting.task_card": "Task cards",
-    "rlcli.envs.environment_protocol": "Interface of environments",
-    "rlcli.envs.vec_env": "Vectorized environments",
-    "rlcli.envs.make": "Make an environment",
-    "rlcli.envs.build": "Build a simulation",
-    "rlcli.envs.direct": "Direct tasks",
-    "rlcli.envs.articulation": "Articulations of direct tasks",
-    "rlcli.envs.step_result": "Step results",
-    "rlcli.envs.observers": "Observers of the step",
-    "rlcli.scene.entity": "Entities",
-    "rlcli.scene.entity_data": "State of entities",
-    "rlcli.sim.markers": "Markers in viewers",
-    "rlcli.sim.env_selection": "Selections of environments",
-    "rlcli.sim.rotations": "Rotations",
-    "rlcli.rl.trainer": "Trainers",
-    "rlcli.rl.trainer_base": "Base class of trainers",
-    "rlcli.rl.budget": "Budget of a training",
-    "rlcli.rl.nan_check": "Checks for NaN and infinity",
-    "rlcli.rl.policy": "Policies",
-    "rlcli.rl.episode_statistics": "Episode statistics",
-    "rlcli.rl.optimizers": "Optimizers",
-    "rlcli.rl.rng": "Random generators",
-    "rlcli.adapters.gymnasium": "Gymnasium environments",
-    "rlcli.adapters.sb3": "Stable-Baselines3 environments",
-    "rlcli.adapters.rsl_rl": "RSL-RL environments",
-    "rlcli.testing": "Contract checks",
-}
-"""Modules with public names -> titles of their pages."""
 _PROJECT = tomllib.loads((DOCS.parent / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 TRAINERS = {
     name: object_reference.partition(":")[0]
@@ -80,27 +52,6 @@ SECTIONS = {
     "success": "Conditions that count an episode as successful.",
 }
 """Section of the terms -> what its terms are."""
-
-
-def public_names(module_name: str) -> list[str]:
-    """Return the public names of a module: its `__all__`, else the classes and functions that it defines."""
-    module = importlib.import_module(module_name)
-    listed = getattr(module, "__all__", None)
-    if listed is not None:
-        return sorted(listed)
-    return sorted(
-        name
-        for name, value in vars(module).items()
-        if not name.startswith("_")
-        and _defined_in(value, module_name)
-        and (inspect.isclass(value) or inspect.isfunction(value))
-    )
-
-
-def _defined_in(value: Any, module_name: str) -> bool:
-    """Return whether a module, or a module of this package, defines the value."""
-    module = str(getattr(value, "__module__", ""))
-    return module == module_name or module.startswith(f"{module_name}.")
 
 
 def public_words() -> list[str]:
@@ -152,11 +103,11 @@ def pages() -> dict[str, str]:
         "agents.md": _agents(),
         "commands.md": _commands(),
         "terms/index.md": _terms_index(),
-        "python/index.md": _python_index(),
+        "python/index.md": python_index(),
     }
     written |= {f"terms/{section}.md": _terms_page(section) for section in SECTIONS}
     package = griffe.load("rlcli", search_paths=[DOCS.parent], docstring_parser="google")
-    written |= {f"python/{_file_name(module)}": _python_page(package, module) for module in MODULES}
+    written |= {f"python/{file_name(module)}": python_page(package, module) for module in MODULES}
     return {path: "\n".join(parts).rstrip("\n") + "\n" for path, parts in written.items()}
 
 
@@ -207,7 +158,7 @@ def _agents() -> Iterator[str]:
 def _models(title: str, schema: dict[str, Any], prefix: str = "") -> Iterator[str]:
     """Yield the table of a model and those of the models inside it."""
     inner = {name: model for name, model in sorted(schema.get("$defs", {}).items()) if "properties" in model}
-    links = {name: f"#{_slug(prefix + name)}" for name in inner}
+    links = {name: f"#{slug(prefix + name)}" for name in inner}
     yield from _model(f"## {title}", schema, links)
     for name, model in inner.items():
         yield from _model(f"## {prefix}{name}", _with_note(name, model, schema), links)
@@ -230,15 +181,10 @@ def _with_note(name: str, model: dict[str, Any], schema: dict[str, Any]) -> dict
     return model | {"description": model.get("description", "") + note}
 
 
-def _slug(heading: str) -> str:
-    """Return the anchor of a heading."""
-    return re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-")
-
-
 def _linked(type_name: str, links: dict[str, str]) -> str:
     """Return the text of a type as the cell of a table; models are links to their sections."""
     return re.sub(
-        r"\w+", lambda word: f"[{word[0]}]({links[word[0]]})" if word[0] in links else word[0], _cell(type_name)
+        r"\w+", lambda word: f"[{word[0]}]({links[word[0]]})" if word[0] in links else word[0], cell(type_name)
     )
 
 
@@ -247,19 +193,19 @@ def _schema_links() -> dict[str, str]:
     from rlcli.config.schema import TaskConfig
 
     models = TaskConfig.model_json_schema()["$defs"]
-    return {name: f"../task-schema.md#{_slug(name)}" for name, model in models.items() if "properties" in model}
+    return {name: f"../task-schema.md#{slug(name)}" for name, model in models.items() if "properties" in model}
 
 
 def _model(heading: str, model: dict[str, Any], links: dict[str, str]) -> Iterator[str]:
     yield f"{heading}\n"
     if model.get("description"):
-        yield _one_line(model["description"]) + "\n"
+        yield one_line(model["description"]) + "\n"
     if not model.get("properties"):
         return
     yield "| key | type | default | meaning |\n| --- | --- | --- | --- |"
     for key, field in model["properties"].items():
-        default = "required" if key in model.get("required", ()) else f"`{_cell(yaml_text(field.get('default')))}`"
-        meaning = _cell(_one_line(field.get("description", "")))
+        default = "required" if key in model.get("required", ()) else f"`{cell(yaml_text(field.get('default')))}`"
+        meaning = cell(one_line(field.get("description", "")))
         yield f"| `{key}` | {_linked(type_text(field), links)} | {default} | {meaning} |"
     further = model.get("additionalProperties")
     if isinstance(further, dict):
@@ -326,12 +272,12 @@ def _terms_page(section: str) -> Iterator[str]:
 def _term(entry: TermEntry) -> Iterator[str]:
     yield f"## {entry.name}\n"
     term = griffe.Docstring(_docstring(entry), parser="google")
-    yield from _docstring_parts(term)
+    yield from docstring_parts(term)
     if entry.keys:
         yield "| key | type | default | meaning |\n| --- | --- | --- | --- |"
     for key in entry.keys:
-        default = "required" if key.required else f"`{_cell(yaml_text(key.default))}`"
-        yield f"| `{key.name}` | {_cell(key.type)} | {default} | {_cell(key.description)} |"
+        default = "required" if key.required else f"`{cell(yaml_text(key.default))}`"
+        yield f"| `{key.name}` | {cell(key.type)} | {default} | {cell(key.description)} |"
     yield f"\n```yaml\n{entry.example}\n```\n"
 
 
@@ -356,7 +302,7 @@ def _commands() -> Iterator[str]:
         for parameter in command.params:
             if getattr(parameter, "hidden", False) or parameter.name == "help":
                 continue
-            yield f"| {_cell(_spellings(parameter))} | {_cell(_default_text(parameter))} | {_cell(_help(parameter))} |"
+            yield f"| {cell(_spellings(parameter))} | {cell(_default_text(parameter))} | {cell(_help(parameter))} |"
         yield ""
 
 
@@ -401,216 +347,7 @@ def _default_text(parameter: Any) -> str:
 
 
 def _help(parameter: Any) -> str:
-    return _DEFAULT.sub("", _one_line(parameter.help or ""))
-
-
-# Python
-
-
-def _file_name(module: str) -> str:
-    return f"{module.removeprefix('rlcli.')}.md"
-
-
-def _python_index() -> Iterator[str]:
-    yield "# Python API\n"
-    yield "After reading this page you can find every public class and function."
-    yield "[Use rlcli from Python](../../guides/python-api.md) shows how they work together. Before version 1.0 a minor"
-    yield "version may change a public name; the changelog lists such changes.\n"
-    yield (
-        "```{toctree}\n:hidden:\n\n"
-        + "\n".join(_file_name(module).removesuffix(".md") for module in MODULES)
-        + "\n```\n"
-    )
-    yield "| module | contents | names |\n| --- | --- | --- |"
-    for module, title in MODULES.items():
-        page = _file_name(module)
-        names = ", ".join(f"[`{name}`]({page}#{_slug(name)})" for name in public_names(module))
-        yield f"| [`{module}`]({page}) | {title} | {names} |"
-
-
-def _python_page(package: griffe.Object | griffe.Alias, module_name: str) -> Iterator[str]:
-    module = package[module_name.removeprefix("rlcli.")]
-    yield f"# {MODULES[module_name]}\n"
-    yield f"Module `{module_name}`.\n"
-    yield from _docstring_parts(module.docstring)
-    members = {name: _resolved(module.all_members[name]) for name in public_names(module_name)}
-    for name, member in members.items():
-        yield from _member(member, name, "##")
-    aliases = _aliases(module)
-    if aliases:
-        rows = (f"| `{alias.name}` | {_cell(_one_line(alias.docstring.value))} |" for alias in aliases)
-        yield "## Type aliases\n"
-        yield "\n".join(["| alias | meaning |", "| --- | --- |", *rows]) + "\n"
-    yield from _types(package, [*members.values(), *aliases])
-
-
-def _aliases(module: Any) -> list[Any]:
-    """Return the type aliases of a module that have a docstring."""
-    attributes = (member for member in module.members.values() if not member.is_alias and member.is_attribute)
-    return [member for member in attributes if str(member.annotation) == "TypeAlias" and member.docstring]
-
-
-_PARAGRAPH = "\n\n"
-"""What separates the first paragraph of a docstring from the others."""
-
-
-def _resolved(member: Any) -> Any:
-    """Return a member of a module, or what an import of it stands for."""
-    return member.final_target if member.is_alias else member
-
-
-def _types(package: griffe.Object | griffe.Alias, members: list[Any]) -> Iterator[str]:
-    """Yield what the types of rlcli in signatures of a page are; members of the page itself are left out."""
-    public = {
-        _resolved(package[module.removeprefix("rlcli.")].all_members[name]).path: f"{_file_name(module)}#{_slug(name)}"
-        for module in MODULES
-        for name in public_names(module)
-    }
-    rows: dict[str, str] = {}
-    for path in dict.fromkeys(path for member in members for path in _annotated_types(member)):
-        name = path.rpartition(".")[2]
-        if not path.startswith("rlcli.") or name.startswith("_"):
-            continue
-        found = _resolved(package[path.removeprefix("rlcli.")])
-        if found in members:
-            continue
-        text = f"[`{name}`]({public[found.path]})" if found.path in public else f"`{name}` (`{found.module.path}`)"
-        if found.docstring:
-            rows[name] = f"- {text}: {_escaped(_one_line(found.docstring.value.partition(_PARAGRAPH)[0]))}"
-        elif found.is_attribute and found.value is not None:
-            rows[name] = f"- {text}: `{found.value}`"
-    if rows:
-        yield "## Types in the signatures\n"
-        yield "\n".join(rows[name] for name in sorted(rows)) + "\n"
-
-
-def _annotated_types(member: Any) -> Iterator[str]:
-    """Yield the paths of the types in the annotations of a function, an attribute, or the members of a class."""
-    annotations = []
-    if member.is_function:
-        annotations = [*(parameter.annotation for parameter in member.parameters), member.returns]
-    elif member.is_attribute:
-        annotations = [member.annotation]
-    elif member.is_class:
-        for name, inner in member.members.items():
-            if not inner.is_alias and (not name.startswith("_") or name == "__init__"):
-                yield from _annotated_types(inner)
-    for annotation in annotations:
-        if isinstance(annotation, griffe.Expr):
-            yield from (part.canonical_path for part in annotation if isinstance(part, griffe.ExprName))
-
-
-def _member(member: Any, name: str, level: str) -> Iterator[str]:
-    yield f"{level} {name}\n"
-    if member.is_function:
-        yield f"```python\n{_signature(member, name)}\n```\n"
-        yield from _docstring_parts(member.docstring)
-    elif member.is_class:
-        constructor = member.all_members.get("__init__")
-        if constructor is not None and constructor.is_function and not constructor.inherited:
-            yield f"```python\n{_signature(constructor, name)}\n```\n"
-        yield from _docstring_parts(member.docstring)
-        exit_code = member.all_members.get("exit_code")
-        if exit_code is not None and exit_code.value is not None:
-            yield f"[Exit code](../exit-codes.md) of the command line: {_exit_code(member)}.\n"
-        yield from _attributes(member)
-        for inner_name, inner in member.members.items():
-            if not inner_name.startswith("_") and inner.is_function:
-                yield from _member(inner, f"{name}.{inner_name}", "###")
-    else:
-        if member.value is not None:
-            yield f"```python\n{name} = {member.value}\n```\n"
-        yield from _docstring_parts(member.docstring)
-
-
-def _exit_code(error: Any) -> int:
-    value = getattr(importlib.import_module(error.module.path), error.name).exit_code
-    return int(value)
-
-
-def _attributes(member: Any) -> Iterator[str]:
-    """Yield the table of the public attributes and properties of a class that have a docstring."""
-    rows = [
-        f"| `{name}` | {_cell(_code(attribute.annotation))} | {_cell(_one_line(attribute.docstring.value))} |"
-        for name, attribute in member.members.items()
-        if not name.startswith("_") and attribute.is_attribute and attribute.docstring
-    ]
-    if rows:
-        yield "\n".join(["| attribute | type | meaning |", "| --- | --- | --- |", *rows]) + "\n"
-
-
-def _signature(function: Any, name: str) -> str:
-    """Return the signature of a function, one parameter a line where it is long."""
-    parts, keyword_only = [], False
-    for parameter in function.parameters:
-        if parameter.name in ("self", "cls"):
-            continue
-        kind = parameter.kind.value
-        if kind == "keyword-only" and not keyword_only:
-            keyword_only = True
-            parts.append("*")
-        stars = {"variadic positional": "*", "variadic keyword": "**"}.get(kind, "")
-        keyword_only |= stars == "*"
-        text = f"{stars}{parameter.name}" + (f": {parameter.annotation}" if parameter.annotation else "")
-        parts.append(
-            text + (f" = {_default(function, parameter)}" if parameter.default is not None and not stars else "")
-        )
-    returns = f" -> {function.returns}" if function.returns and function.name != "__init__" else ""
-    line = f"{name}({', '.join(parts)}){returns}"
-    return line if len(line) <= 100 else f"{name}(\n    " + ",\n    ".join(parts) + f",\n){returns}"
-
-
-def _default(function: Any, parameter: Any) -> str:
-    """Return the default of a parameter as code; for the name of a constant, its value if that is short."""
-    text = str(parameter.default)
-    if text.isidentifier():
-        value = getattr(importlib.import_module(function.module.path), text, None)
-        if type(value) in (int, float, str) and len(repr(value)) <= 30:
-            return json.dumps(value)
-    return text
-
-
-def _docstring_parts(docstring: griffe.Docstring | None) -> Iterator[str]:
-    """Yield the sections of a Google-style docstring as Markdown."""
-    if docstring is None:
-        return
-    for section in docstring.parse("google", warnings=False):
-        kind = section.kind.value
-        if kind == "text":
-            yield _escaped(section.value) + "\n"
-        elif kind in ("parameters", "attributes"):
-            yield (
-                "\n".join(f"- `{item.name}`: {_escaped(_one_line(item.description))}" for item in section.value) + "\n"
-            )
-        elif kind == "raises":
-            lines = (f"- `{item.annotation}`: {_escaped(_one_line(item.description))}" for item in section.value)
-            yield "Raises:\n\n" + "\n".join(lines) + "\n"
-        elif kind in ("returns", "yields"):
-            text = " ".join(_escaped(_one_line(item.description)) for item in section.value)
-            yield f"{kind.capitalize()}: {text}\n"
-        elif kind == "admonition":
-            yield f"{section.title}: {_escaped(section.value.description)}\n"
-        else:
-            yield "\n".join(f"```python\n{text}\n```" for _, text in section.value) + "\n"
-
-
-def _escaped(text: str) -> str:
-    """Return text of a docstring as Markdown: `<` and stars outside of code stay what they are."""
-    parts = re.split(r"(```.*?```|`[^`]*`)", text, flags=re.DOTALL)
-    parts[::2] = [part.replace("<", "&lt;").replace("*", "\\*").replace("|", "\\|") for part in parts[::2]]
-    return "".join(parts)
-
-
-def _code(value: Any) -> str:
-    return f"`{value}`" if value is not None else ""
-
-
-def _one_line(text: str) -> str:
-    return " ".join(text.split())
-
-
-def _cell(text: str) -> str:
-    return re.sub(r"(?<!\\)\|", r"\\|", text).replace("<", "&lt;")
+    return _DEFAULT.sub("", one_line(parameter.help or ""))
 
 
 if __name__ == "__main__":

@@ -10,7 +10,9 @@ def reference():
     """The module `docs/reference.py`."""
     spec = importlib.util.spec_from_file_location("reference", REPOSITORY / "docs" / "reference.py")
     module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(REPOSITORY / "docs")  # as for `python docs/reference.py`
+        spec.loader.exec_module(module)
     return module
 
 

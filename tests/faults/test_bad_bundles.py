@@ -7,7 +7,8 @@ import shutil
 import pytest
 import safetensors.torch
 import torch
-from support.bad_checkpoints import PLAYED, Bomb, Case, forged, named, setting
+from support.bad_checkpoints import PLAYED, Case, forged, named
+from support.checkpoint_damage import Bomb, setting
 from support.fault_sizes import amount, chosen
 from support.saved_states import rehash
 from test_bad_checkpoints import command, run_reader, snapshot

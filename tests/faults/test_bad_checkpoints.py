@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from support.bad_checkpoints import Bomb, Case, cut_and_flipped, forged, named
+from support.bad_checkpoints import Case, cut_and_flipped, forged, named
+from support.checkpoint_damage import Bomb
 from support.fault_sizes import amount, chosen
 
 from rlcli.cli.app import main
