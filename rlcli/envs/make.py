@@ -15,6 +15,7 @@ from rlcli.envs.vec_env import VecEnv
 from rlcli.machine.garbage_collection import restore_garbage_collection
 from rlcli.progress import track
 from rlcli.registry import load_object
+from rlcli.registry.plugin_imports import current_folder_kept
 
 _MANAGED, _DIRECT = "rlcli.envs.managed:ManagedEnv", "rlcli.envs.direct:DirectEnv"
 """Environment class of each workflow, imported on demand."""
@@ -45,6 +46,6 @@ def make_env(
         env_class = resolved.format.load(resolved.format.spec.environment)
     else:
         env_class = load_object(_MANAGED if resolved.source.task is None else _DIRECT)
-    with track(f"building {resolved.task.scene.num_envs} environments"):
+    with track(f"building {resolved.task.scene.num_envs} environments"), current_folder_kept():
         env: VecEnv = env_class(resolved, seed=seed, device=device, shared_streams=shared_streams, shard=shard)
     return env

@@ -26,6 +26,7 @@ from rlcli.envs.step_result import Episodes, StepRecord, StepResult
 from rlcli.envs.workflow import Workflow
 from rlcli.machine.devices import require_device
 from rlcli.managers.term_binding import Binder
+from rlcli.registry.plugin_imports import current_folder_kept
 from rlcli.sim.engine import Engine
 from rlcli.sim.env_selection import Field, Selection
 from rlcli.sim.saved_tensors import means
@@ -120,6 +121,7 @@ class VecEnv(Workflow):
         self._action_columns = self.layout.action_columns()
         self._counters.set_success(success, self.step_dt)
 
+    @current_folder_kept()  # a hook of the task may change it
     def reset(self, seed: int | None = None, *, episode: int = 0) -> dict[str, Tensor]:
         """Start a new episode everywhere, and return observations by group; see `Environment.reset`."""
         if seed is not None:
@@ -136,6 +138,7 @@ class VecEnv(Workflow):
         return self._observe()
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # a diverging simulation: the guard reports it
+    @current_folder_kept()
     def step(self, action: Tensor, restart: Tensor | None = None) -> StepResult:
         """Apply one action for `decimation` physics steps; for arguments and errors see `Environment.step`.
 

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 from rlcli.config.layers import flags
 from rlcli.errors import CheckpointError, MachineError, TaskError, UsageError, require_known
 from rlcli.registry.find import path_of
-from rlcli.registry.plugin_imports import current_folder_kept
 from rlcli.runs.atomic_io import require_regular, require_writable
 from rlcli.runs.run import RECORD, Run
 from rlcli.runs.run_ref import default_runs_dir, find_run, list_runs
@@ -305,13 +304,12 @@ def run_episodes(
     """Evaluate the policy of a session; return the summary, and the recorder of the episodes if `records` is true."""
     from rlcli.evaluation.evaluate import evaluate
 
-    with current_folder_kept():  # a hook of the task may change it
-        if not records:
-            return evaluate(session.env, session.act, episodes).summary(), None
-        from rlcli.replay.episode_recorder import EpisodeRecorder
+    if not records:
+        return evaluate(session.env, session.act, episodes).summary(), None
+    from rlcli.replay.episode_recorder import EpisodeRecorder
 
-        with session.env.observers.added(EpisodeRecorder(session.env, episodes)) as recorder:
-            return evaluate(session.env, session.act, episodes).summary(), recorder
+    with session.env.observers.added(EpisodeRecorder(session.env, episodes)) as recorder:
+        return evaluate(session.env, session.act, episodes).summary(), recorder
 
 
 def save_episodes(

@@ -42,6 +42,7 @@ class CrashDumper(StepObserver):
 
     def __init__(self, env: Environment, folder: Path, *, parents: bool = False) -> None:
         self._env, self._folder, self._parents = env, folder, parents
+        self._absolute = folder.absolute()  # a hook of the task may change the current folder
         if env.engine.replayable is not None:
             env.engine.replayable.record_calls(CALLS)
         env.observers.add(self)
@@ -61,7 +62,7 @@ class CrashDumper(StepObserver):
             message += "; there is no dump: steps on a GPU cannot be replayed"
         else:
             try:
-                file = write_dump(env, found, pending, self._folder, self._parents)
+                file = self._folder / write_dump(env, found, pending, self._absolute, self._parents).name
                 message += f"; dump {file}; to replay it: rlcli replay {shlex.quote(str(file))}"
             except MachineError as error:
                 message += f"; there is no dump: {error.message}"

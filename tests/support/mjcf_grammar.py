@@ -15,7 +15,7 @@ import mujoco
 from rlcli.errors import Problem, one_line
 from rlcli.scene.mjcf_safety_check import BadModel
 from rlcli.scene.untrusted_mjcf import read_mjcf
-from support.case_runs import in_child
+from support.case_runs import in_children
 
 RICH = """
 <mujoco model="rich">
@@ -191,7 +191,7 @@ def write(seed, folder):
 def run(seed, folder):
     """Run a case in a child process; return its message, and what is wrong with it (empty: nothing)."""
     write(seed, folder)
-    ended = in_child(lambda: attempt(folder), SECONDS, MEMORY)
+    ((_, ended),) = in_children(attempt, [folder], SECONDS, MEMORY)
     return ended.text, ended.wrong or ("" if ended.text == "taken" else complaint(ended.text, folder))
 
 
