@@ -109,15 +109,17 @@ class Robot:
         velocity: follow velocity commands; reach: move the last body to a goal; balance: keep the default pose.
         """
         driven, undriven = len(self.driven), [self.name(j) for j in self.passive]
-        without = f"{len(undriven)} of its joints have no actuator of their own ({listing(undriven, 3)})"
+        joints = _count(driven, "driven joint")
+        has = "has no actuator of its own" if len(undriven) == 1 else "have no actuator of their own"
+        without = f"{len(undriven)} of its joints {has} ({listing(undriven, 3)})"
         if self.free:
             if obstacle := self.obstacle_to("velocity"):
                 return "balance", obstacle
             if driven < 4:
-                return "balance", f"its base floats, but it has only {driven} driven joints, and walking needs 4"
+                return "balance", f"its base floats, but it has only {joints}, and walking needs 4"
             if driven <= len(undriven):
                 return "balance", f"its base floats, but {without}, and only {driven} have one"
-            return "velocity", f"its base floats, it has {len(self.feet())} feet and {driven} driven joints"
+            return "velocity", f"its base floats, it has {_count(len(self.feet()), 'foot', 'feet')} and {joints}"
         if undriven:
             return "balance", f"its base is fixed, but {without}"
         if driven < 2:
@@ -386,6 +388,11 @@ def _lowest_z(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float:
     if kind == int(kinds.mjGEOM_PLANE):
         return math.inf
     return z - float(np.abs(turn[2]) @ size)
+
+
+def _count(number: int, one: str, several: str = "") -> str:
+    """Return a number with its noun; `several` is the plural, by default the singular with an s."""
+    return f"{number} {one if number == 1 else several or f'{one}s'}"
 
 
 def round3(value: float) -> float:
