@@ -48,7 +48,7 @@ def read_rows(run: Run, *, strict: bool = False) -> Iterator[dict[str, Any]]:
                     raise CheckpointError(f"{run.metrics}:{number} is corrupt: not a row of metrics; delete this line")
                 else:
                     _log.warning(
-                        "%s:%d is not a row of metrics; this and all later rows are left out", file.name, number
+                        "%s:%d is not a row of metrics; the rows from there on are left out", file.name, number
                     )
                     return
     except FileNotFoundError:
