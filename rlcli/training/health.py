@@ -164,8 +164,7 @@ class Health:
 
 
 def probe(trainer: Trainer) -> dict[str, float]:
-    """Return the metrics `Health/*` that the checks read; empty if not enough observations are known yet, and for a
-    trainer that does not derive from `BaseTrainer`."""
+    """Return the metrics `Health/*`; empty with fewer than 2 observations, or if `trainer` is no `BaseTrainer`."""
     if not isinstance(trainer, BaseTrainer) or len(trainer.recent_obs) < 2:
         return {}
     found, begin, obs = {}, 0, trainer.recent_obs
