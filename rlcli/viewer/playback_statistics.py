@@ -65,7 +65,7 @@ class PlaybackStatistics:
             self._last[env_id] = ", ".join(parts)
 
     def last_episode(self, env_id: int) -> str:
-        """Return the return, length and causes of the end of an environment's last episode as text; empty without one."""
+        """Return text about an environment's last episode: return, length, causes of its end; empty without one."""
         return self._last.get(env_id, "")
 
     def clear_curves(self) -> None:

@@ -76,7 +76,7 @@ class TrainingVideos(StepObserver):
         return file
 
     def before_step(self) -> None:
-        """Called before each step of the filmed environment.
+        """End the recording if the training is being stopped; called before each step of the filmed environment.
 
         Raises:
             VideoAborted: if a signal has asked the training to stop.

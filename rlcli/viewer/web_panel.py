@@ -153,7 +153,7 @@ class WebPanel(plugin.ViewerPlugin):  # type: ignore[misc]  # MuJoCo has no type
                 if imgui.Selectable(name, step == view.checkpoint):
                     playback.submit(partial(playback.switch, step))
             imgui.EndCombo()
-        changed, follow = imgui.Checkbox("Play new ones as they appear", view.follow)
+        changed, follow = imgui.Checkbox("Play new checkpoints as they appear", view.follow)
         if changed:
             playback.submit(partial(playback.set_follow, follow))
 
@@ -162,7 +162,7 @@ class WebPanel(plugin.ViewerPlugin):  # type: ignore[misc]  # MuJoCo has no type
             imgui.SeparatorText("Commands")
         for knob, command in zip(view.knobs, view.commands, strict=True):
             changed, hold = imgui.Checkbox(f"hold##{knob.name}", knob.name in view.held)
-            imgui.SetItemTooltip("Checked: keep this value. Unchecked: the task samples it.")
+            imgui.SetItemTooltip("Checked: keep this value. Unchecked: the task samples the value.")
             imgui.SameLine()
             imgui.SetNextItemWidth(imgui.GetContentRegionAvail().x * 0.5)
             moved, value = imgui.SliderFloat(knob.label, command, knob.low, knob.high)
