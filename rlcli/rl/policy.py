@@ -20,7 +20,7 @@ from rlcli.rl.cnn import Cnn, CnnSpec
 ACTIVATIONS: dict[str, type[nn.Module]] = {"elu": nn.ELU, "relu": nn.ReLU, "tanh": nn.Tanh, "silu": nn.SiLU}
 _LOG_STD_RANGE = (-20.0, 2.0)
 _MAX_BYTES = 2**31
-_OTHER = "export it again, or use another checkpoint"
+_OTHER = "export the policy again, or use another checkpoint"
 _LogStd = Annotated[float, Field(ge=-80, le=80)]
 """Log standard deviation; the limits keep the standard deviation in the range of float32."""
 Layers = Annotated[list[Width], Field(max_length=100)]

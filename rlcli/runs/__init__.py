@@ -1,1 +1,1 @@
-"""Modules that write, read and compare the folders of runs; a run is one training, with checkpoints and metrics."""
+"""Write, read and compare the folders of runs; a run is one training, with configuration, metrics and checkpoints."""

@@ -1,6 +1,6 @@
-"""Atomic writing of files: after a crash a reader finds either the old content or the new one.
+"""Write files atomically: after a crash a reader finds either the whole old content or the whole new content.
 
-The files of runs, exports and reports are written with it. Errors of the disk get a hint.
+The files of runs, exports and reports are written by these functions. Errors of the disk become errors with a hint.
 """
 
 import contextlib
@@ -67,7 +67,7 @@ def require_writable(file: Path) -> None:
     """Check, before any work, that a file can be written: no folder or device has its name, and its folder is writable.
 
     Access rights do not show this for every folder, so an empty temporary file is created and removed. If the folder
-    does not exist yet, the nearest folder above it that exists is tested.
+    does not exist yet, the nearest existing folder above is tested.
 
     Raises:
         UsageError: for a folder, a pipe, a socket or a device.
@@ -93,9 +93,9 @@ def write_synced(file: Path, data: bytes) -> None:
 
 
 def remove_leftovers(folder: Path, name: str) -> None:
-    """Remove the temporary files and folders `.NAME.tmp-PID...` in a folder that killed processes have left.
+    """Remove the temporary files and folders `.NAME.tmp-PID...` that killed processes have left in a folder.
 
-    `name` is the NAME of the file or folder to which the temporary ones would have been renamed.
+    `name` is NAME, the file or folder to which the processes would have renamed the temporary ones.
     """
     for leftover in folder.glob(f".{glob.escape(name)}.tmp-*") if os.name == "posix" else ():
         process = re.match(r"\d+", leftover.name.rpartition(".tmp-")[2])
@@ -135,7 +135,7 @@ def to_json(value: object) -> str:
 
 
 def finite_json(value: Any) -> Any:
-    """Return a copy of JSON data in which NaN and infinity are the texts `nan` and `inf`, which JSON can hold."""
+    """Return a copy of JSON data in which NaN and infinity are replaced by the texts `nan`, `inf` and `-inf`."""
     if isinstance(value, dict):
         return {key: finite_json(inner) for key, inner in value.items()}
     if isinstance(value, list):
@@ -144,7 +144,7 @@ def finite_json(value: Any) -> Any:
 
 
 def disk_error(path: Path, error: OSError) -> MachineError:
-    """Convert an OSError of writing a path to a MachineError, with a hint that fits the cause (its errno)."""
+    """Return the MachineError for an OSError while writing a path, with a hint that fits the cause (errno)."""
     gone = [str(folder) for folder in path.parents if error.errno == errno.ENOENT and not folder.exists()]
     missing = f" (there is no folder {gone[-1]})" if gone else ""
     hint = _HINTS.get(error.errno or 0) if gone or error.errno != errno.ENOENT else "choose another folder"
@@ -165,7 +165,7 @@ def require_lock(path: Path) -> None:
 
 @contextlib.contextmanager
 def disk_errors(path: Path, *, remove: bool = False) -> Iterator[None]:
-    """Turn an OSError inside the block into a MachineError that names the path.
+    """Turn an OSError inside the `with` block into a MachineError that names the path.
 
     Args:
         path: the file or folder that the block writes.
@@ -187,8 +187,8 @@ def disk_errors(path: Path, *, remove: bool = False) -> Iterator[None]:
 
 
 _HINTS = {
-    2: "create the folder; if it was moved or deleted meanwhile, put it back",
-    27: "files are limited to the size that `ulimit -f` shows: raise this limit, or write less",
+    2: "create the folder; if the folder was moved or deleted meanwhile, put it back",
+    27: "files are limited to the size that `ulimit -f` shows: raise this limit, or write smaller files",
     28: "free some space",
     36: "a name in a path has at most 255 bytes: shorten it",
     13: "choose another folder with --runs-dir",

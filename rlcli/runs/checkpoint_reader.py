@@ -1,6 +1,6 @@
-"""Reader of checkpoints, which are folders of safetensors and JSON files.
+"""Read checkpoints, which are folders of safetensors and JSON files, and check their files.
 
-Sizes and hashes are checked, and nothing is unpickled, because a checkpoint may be untrusted.
+A checkpoint may be untrusted: sizes and hashes are checked, and nothing is unpickled.
 """
 
 import hashlib
@@ -80,7 +80,10 @@ class Shard(FileModel):
 
 
 class _Log(FileModel):
-    """Entry of manifest.json for a log, such as a replay buffer: rows `first` to `stop` - 1, in several files."""
+    """Entry of manifest.json for a log (data in rows, such as a replay buffer).
+
+    The checkpoint needs the rows `first` to `stop` - 1; the files `shards` hold them.
+    """
 
     first: Count
     stop: Count
@@ -122,7 +125,7 @@ class _Header(RootModel[Annotated[dict[str, _TensorEntry], Field(max_length=20_0
 
 
 class _State(FileModel):
-    """Values of state.json that every trainer saves. Each trainer checks its further values itself."""
+    """Values of state.json that several trainers save; a trainer checks the other values itself."""
 
     iteration: Count = 0
     env_steps: Count = 0
@@ -147,13 +150,11 @@ class _Statistics(FileModel):
 
 @dataclass(frozen=True, slots=True)
 class Checkpoint:
-    """A checkpoint: a folder with files of a training at one step. Each file is checked when it is read.
-
-    `manifest` is the content of manifest.json, which lists the files with their sizes and hashes.
-    """
+    """A checkpoint: a folder with the files of a training at one step. Each file is checked when it is read."""
 
     folder: Path
     manifest: dict[str, Any]
+    """Content of manifest.json, which lists the files with their sizes and hashes."""
 
     @property
     def step(self) -> int:
@@ -166,7 +167,11 @@ class Checkpoint:
         return check_json(_Iteration, self.manifest, self.folder / "manifest.json").iteration
 
     def json(self, name: str) -> dict[str, Any]:
-        """Return the content of a JSON file of the checkpoint, such as `policy.json`."""
+        """Return the content of a JSON file of the checkpoint, such as `policy.json`, after a check of its hash.
+
+        Raises:
+            CheckpointError: if the file is missing or corrupt.
+        """
         return parse_json(self._data(name, JSON_LIMIT), self.folder / name)
 
     def tensors(self, part: str, limit: int | None = None) -> dict[str, Tensor]:
@@ -177,7 +182,7 @@ class Checkpoint:
             limit: largest size of the file [bytes]; None: the default of the part, at most a third of the memory.
 
         Raises:
-            CheckpointError: if the file is larger, or not a valid safetensors file.
+            CheckpointError: if the file is missing, larger than the limit, or corrupt.
         """
         name = f"{part}.safetensors"
         if limit is None:
@@ -233,10 +238,10 @@ class Checkpoint:
         return TrainerState(tensors, values, {name: self._rows(name) for name in self.shards()})
 
     def verify(self, *, whole: bool) -> None:
-        """Read and check the policy; with `whole` also everything else that is needed to resume the training.
+        """Read and check the policy; if `whole`, also everything else that is needed to resume the training.
 
         Raises:
-            CheckpointError: at the first error.
+            CheckpointError: if a file is missing or corrupt.
         """
         if not whole:
             self.policy()
@@ -318,12 +323,13 @@ def open_checkpoint(folder: Path) -> Checkpoint:
     manifest = parse_json(data, file)
     if type(manifest.get("format")) is not int or manifest["format"] != FORMAT:
         message = f"{folder} has checkpoint format {str(manifest.get('format'))[:40]}; this rlcli reads {FORMAT}"
-        raise FormatError(message, hint="use the version of rlcli that wrote it (run.json or manifest.json names it)")
+        hint = "install the version of rlcli that wrote the checkpoint; run.json or manifest.json names the version"
+        raise FormatError(message, hint=hint)
     step = check_json(_Manifest, manifest, file).step
     name = folder.name
     if name.isdecimal() and name.isascii() and len(name) >= 12 and int(name) != step:
         raise CheckpointError(
-            f"{file} is corrupt: it has step {step}, its folder is named {name}; rename the folder to {step:012d}"
+            f"{file} has step {step}, but its folder is named {name}; rename the folder to {step:012d}"
         )
     return Checkpoint(folder, manifest)
 
@@ -331,7 +337,7 @@ def open_checkpoint(folder: Path) -> Checkpoint:
 def steps(checkpoints: Path) -> list[int]:
     """Return the environment steps of the checkpoints in a run's folder `checkpoints`, ascending.
 
-    Links and folders with other names are ignored.
+    The steps are read from the names of the folders, 12 digits each; links and other names are ignored.
     """
     if checkpoints.is_symlink() or not checkpoints.is_dir():
         return []
@@ -345,9 +351,10 @@ def sha256(data: bytes) -> str:
 
 
 def _verified(file: Path, size: int, digest: str, limit: int) -> bytes:
-    """Return the content of a file, and check its size and its SHA-256, which manifest.json stores.
+    """Return the content of a file after a check of its size [bytes] and its SHA-256 (`digest`) in manifest.json.
 
-    A file of more than `limit` bytes is not read.
+    Raises:
+        CheckpointError: if the file differs from the manifest, or has more than `limit` bytes.
     """
     data = read_file(file, limit, size=size, missing=f"{file} is missing; choose an older checkpoint: RUN@step:N")
     if len(data) != size:
@@ -372,7 +379,11 @@ def _tensors(data: bytes, file: Path) -> dict[str, Tensor]:
 
 
 def _check_state(values: dict[str, Any], step: int, file: Path) -> None:
-    """Check the content of state.json: the values that every trainer saves. `step` is the step in manifest.json."""
+    """Check the values of state.json that several trainers save. `step` is the step in manifest.json.
+
+    Raises:
+        CheckpointError: if a value is malformed, or the steps differ.
+    """
     check_json(_State, values, file)
     if values.get("env_steps", step) != step:
         found = values["env_steps"]

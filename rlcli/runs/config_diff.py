@@ -1,6 +1,6 @@
-"""Comparison of two configurations, with a category for each difference: physics, MDP, agent or cosmetic.
+"""Compare two configurations, and assign each difference a category: physics, MDP, agent or cosmetic.
 
-`rlcli diff` and the report of a run use it.
+`rlcli diff` prints the differences.
 """
 
 from __future__ import annotations
@@ -44,30 +44,30 @@ _EMPTY: tuple[Any, ...] = (None, {})
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """One difference between two runs or configurations, left and right.
-
-    `where` names the key, file, metric or tensor that differs. None stands for a value that one side does not have.
-    """
+    """One difference between two runs or configurations, which are called left and right."""
 
     where: str
+    """The key, file, metric or tensor that differs."""
     left: Any
+    """Value of the left side; None: the left side has no value."""
     right: Any
+    """Value of the right side; None: the right side has no value."""
     left_from: str | None = None
-    """Where the left value was written, such as `config.yaml:12:3`."""
+    """Place where the left value was written, such as `config.yaml:12:3`; None: not known."""
     right_from: str | None = None
+    """Place where the right value was written; None: not known."""
     category: str | None = None
-    """One of `CATEGORIES` for a difference of configurations."""
+    """One of `CATEGORIES` for a difference of configurations; None for other differences."""
 
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """Result of the comparison of one part, such as the configurations.
-
-    `compared` is the amount that was compared, as text for the table, such as `120 keys`.
-    """
+    """Result of the comparison of one part of two runs, such as their configurations."""
 
     name: str
+    """Name of the part, such as `configuration`."""
     compared: str
+    """What was compared, as text for the table, such as `120 keys`."""
     differences: list[Difference] = field(default_factory=list)
 
 
@@ -76,7 +76,7 @@ Values = dict[Path, tuple[Any, str | None]]
 
 
 def run_values(run: Run) -> Values:
-    """Return the configuration and the seed with which a run was trained.
+    """Return every key of the configuration with which a run was trained, and the seed, with their values and places.
 
     Raises:
         CheckpointError: if the run's configuration cannot be read.
@@ -95,7 +95,7 @@ def run_values(run: Run) -> Values:
 
 
 def task_values(resolved: Resolved) -> Values:
-    """Return the configuration of a task with the chosen agent and all defaults, but without a seed."""
+    """Return every key of a task's configuration, with its value and place; a task has no seed."""
     from rlcli.config.dump import origins, to_data
 
     data, places = to_data(resolved), origins(resolved)
@@ -103,7 +103,7 @@ def task_values(resolved: Resolved) -> Values:
 
 
 def compare_values(left: Values, right: Values) -> Section:
-    """Compare two configurations: find every key whose values differ, in the order of `CATEGORIES`."""
+    """Return every key whose values differ between two configurations, in the order of `CATEGORIES`."""
     absent = (None, None)
     keys = list(dict.fromkeys([*left, *right]))
     pairs = {path: (left.get(path, absent), right.get(path, absent)) for path in keys}
@@ -118,9 +118,9 @@ def compare_values(left: Values, right: Values) -> Section:
 
 
 def compare_files(left: Mapping[str, str], right: Mapping[str, str]) -> Section:
-    """Compare the files of two tasks. `left` and `right` map the name of a file to its SHA-256.
+    """Return the files that differ between two tasks. `left` and `right` map the name of a file to its SHA-256.
 
-    Differing Python files are of the category MDP, all others (robot models) of the category physics.
+    Differences of Python files have the category MDP, those of other files (such as robot models) physics.
     """
     keys = list(dict.fromkeys([*left, *right]))
     found = [
@@ -156,7 +156,7 @@ def category(path: Path, *, observes_images: bool = False) -> str:
 
 
 def as_text(value: object) -> str:
-    """Return a value as JSON text to compare: 1 and 1.0 differ, NaN equals NaN."""
+    """Return a value as JSON text, for comparisons: 1 and 1.0 differ, NaN equals NaN."""
     return json.dumps(value, sort_keys=True, default=str)
 
 

@@ -1,4 +1,4 @@
-"""Reader and writer of the evaluations stored in a run: the last result of `rlcli eval` for each checkpoint."""
+"""Read and write the evaluations stored in a run: the last result of `rlcli eval` for each checkpoint."""
 
 import re
 from collections.abc import Mapping
@@ -66,7 +66,8 @@ def write_evaluation(run: Run, step_name: str, document: Mapping[str, Any]) -> P
         document: the JSON document that `rlcli eval --json` prints.
 
     Raises:
-        CheckpointError: if the run's folder holds links or special files: a write could leave the run.
+        CheckpointError: if the folder `evaluations` has links out of the run, or pipes or devices; or `step_name` is
+            not a number.
         MachineError: if the disk reports an error.
     """
     require_own(run, FOLDER)
@@ -80,10 +81,10 @@ def read_evaluation(run: Run, step_name: str) -> dict[str, Any] | None:
     """Return the saved result of `rlcli eval` for a run's checkpoint; None if there is none.
 
     These entries of the result are checked: `episodes`, `seed`, `return` and `length` (mean, std, low, high; for a
-    single episode low and high are None), `reward_terms` (the same for each term, by name), `terminations` (rate, low,
-    high for each term, by name), `diverged`, `diverged_by`. `success` (rate, low, high) and `conditions` (by name:
-    `held`, a share; `value`, a mean, `at_least` and `at_most`, where the condition has them) are missing for a task
-    without success.
+    single episode low and high are None), `reward_terms` (mean, std, low, high of each term, by name), `terminations`
+    (rate, low, high of each term, by name), `diverged`, `diverged_by`. `success` (rate, low, high) and `conditions` (by
+    name: `held`, a share; `value`, a mean, `at_least` and `at_most`, where the condition has them) are missing for a
+    task without success conditions.
 
     Args:
         run: the run.
@@ -106,6 +107,6 @@ def read_evaluation(run: Run, step_name: str) -> dict[str, Any] | None:
 def _file(run: Run, step_name: str) -> Path:
     if not _STEP.fullmatch(step_name):
         raise CheckpointError(
-            f"'{step_name[:40]}' is not the name of a checkpoint's folder; give its step in 12 digits"
+            f"'{step_name[:40]}' is not the name of a checkpoint's folder; give the checkpoint's step with 12 digits"
         )
     return run.folder / FOLDER / f"{step_name}.json"

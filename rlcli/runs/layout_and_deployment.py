@@ -1,7 +1,8 @@
-"""Schema of the entries `layout` and `deployment` of a checkpoint's manifest.json, which may be untrusted.
+"""Schema of the entries `layout` and `deployment` of a checkpoint's manifest.json, and checks against the policy.
 
 The layout lists the columns of observations and actions that a policy was trained with. The deployment record describes
-the environment, with formulas for observations and controls, for programs that run the policy without rlcli.
+the environment, with formulas for observations and controls, for programs that run the policy without rlcli. A manifest
+may be untrusted, so every entry is checked.
 """
 
 import math
@@ -25,7 +26,7 @@ OPS = {
     "rotate": 2, "unrotate": 2, "product": 2, "inverse": 1, "unique": 1, "asin": 1, "angle": 1, "wrap": 1, "below": 4,
     "filter": 1,
 }  # fmt: skip
-"""Operation that a formula may contain, such as `add` -> number of its operands; None: any number."""
+"""Operation that a formula may contain, such as `add` -> number of its operands; None: one or more."""
 FIELDS = {
     "qpos", "qvel", "xpos", "xipos", "xquat", "site_xpos", "cvel", "subtree_com", "sensordata", "qfrc_actuator",
     "mocap_pos", "mocap_quat",
@@ -105,7 +106,7 @@ class _Columns(_Record):
 
 
 class ObservationColumns(_Columns):
-    """Columns of an observation term; with a history, those of the oldest step come first."""
+    """Columns of an observation term; with a history, the columns of the oldest step come first."""
 
     clip: tuple[float, float] | None
     history: int = Field(ge=1)
@@ -115,9 +116,9 @@ class ObservationColumns(_Columns):
 
 
 class ActionColumns(_Columns):
-    """Columns of an action term: command = clip(scale x action + offset).
+    """Columns of an action term, which computes clip(scale x action + offset).
 
-    Without a scale the command is the action, limited to `clip`.
+    Without a scale the term computes clip(action).
     """
 
     offset: list[float] | None
@@ -141,8 +142,8 @@ class LayoutRecord(_Record):
 class _Formula(_Record):
     """Formula (`value`, see `check_formula`) for the columns of a term.
 
-    `closed` is true if the formula computes the columns from MjData, the actions and the commands alone, so that a
-    program needs no code of the task.
+    `closed` is true if the formula needs only MjData, the actions and the commands, so that a program can compute the
+    columns without the code of the task.
     """
 
     @model_validator(mode="after")
@@ -160,9 +161,10 @@ class _Formula(_Record):
 
 
 class ObservationFormula(_Formula):
-    """Formula of an observation term's columns. `value` computes the columns of one step.
+    """Formula of an observation term: `value` computes the term's columns of one step.
 
-    If `closed` is false, there is no formula, and `value` is an input that the task's own code computes.
+    If `closed` is false, there is no formula: `value` is `{given: observation/NAME}`, and the program that runs the
+    policy must compute the columns itself.
     """
 
     name: Name
@@ -210,7 +212,7 @@ class ActuatorModelRecord(_Formula):
 
 
 class CommandRecord(_Record):
-    """A command that the policy receives from outside, such as a velocity."""
+    """A command (goal) that the program must give the policy, such as a velocity: its name, function and size."""
 
     name: Name
     func: Name
@@ -218,7 +220,10 @@ class CommandRecord(_Record):
 
 
 class JointRecord(_Record):
-    """A hinge or slide joint, and the gains of its actuator; both are null without an actuator, and 0 for a motor."""
+    """A hinge or slide joint with its default position and the gains of its actuator.
+
+    The gains (stiffness, damping) are null without an actuator, and 0 for a motor.
+    """
 
     name: Name
     entity: Name
@@ -230,7 +235,7 @@ class JointRecord(_Record):
 
 
 class ActuatorRecord(_Record):
-    """An actuator of the model. Lists of actuators have the order of `MjData.ctrl`."""
+    """An actuator of the model, and the range of its control. Lists of actuators have the order of `MjData.ctrl`."""
 
     name: Name
     range: tuple[float, float] | None
@@ -254,7 +259,7 @@ def layout_of(checkpoint: Checkpoint, policy: Policy) -> LayoutRecord:
     """Return the layout (columns of observations and actions) of a checkpoint, and check that it fits the policy.
 
     Raises:
-        CheckpointError: if there is no layout, or one with other numbers of columns.
+        CheckpointError: if there is no layout, or its numbers of columns differ from those of the policy.
     """
     file, spec = checkpoint.folder / "manifest.json", policy.spec
     layout = check_json(LayoutRecord, checkpoint.manifest.get("layout"), file, "layout", hint=_NO_LAYOUT)
@@ -266,18 +271,18 @@ def layout_of(checkpoint: Checkpoint, policy: Policy) -> LayoutRecord:
         if found != expected:
             raise CheckpointError(
                 f"{file} does not fit policy.json: {found} columns of {kind}, expected {expected}; the checkpoint is"
-                " damaged: use another one"
+                " damaged: use another checkpoint"
             )
     return layout
 
 
 def deployment_of(checkpoint: Checkpoint, policy: Policy, found: object = None) -> DeploymentRecord | None:
-    """Return the checkpoint's description of the environment for programs without rlcli; None if it has none.
+    """Return the checkpoint's description of the environment for programs without rlcli; None if there is none.
 
     Args:
         checkpoint: the checkpoint.
-        policy: its policy.
-        found: a description to use if the checkpoint has none.
+        policy: the policy of the checkpoint.
+        found: a description (JSON data) to use if the checkpoint has none; None: use no other.
 
     Raises:
         CheckpointError: if the record is malformed, or does not fit the policy.
@@ -294,13 +299,13 @@ def deployment_of(checkpoint: Checkpoint, policy: Policy, found: object = None) 
     if begins != ends or any(width <= 0 or width % t.history for width, t in zip(widths, terms, strict=True)):
         raise CheckpointError(
             f"{file}: the record of the observation and action columns (deployment) does not fit the policy; the"
-            " checkpoint is damaged: use another one"
+            " checkpoint is damaged: use another checkpoint"
         )
     return record
 
 
 def deployment_differences(checkpoint: Checkpoint, layout: object, deployment: Any, randomized: bool) -> list[str]:
-    """Return the keys in which the layout and deployment records of a checkpoint and an environment differ.
+    """Return the dotted keys in which the layout and deployment records of a checkpoint and an environment differ.
 
     Formulas are not compared.
 
@@ -308,7 +313,7 @@ def deployment_differences(checkpoint: Checkpoint, layout: object, deployment: A
         checkpoint: the checkpoint.
         layout: the environment's layout, as plain JSON.
         deployment: the environment's description, as `rlcli.deploy.env_description.describe` returns it.
-        randomized: do not compare gains and the start state, because the task randomises them.
+        randomized: whether the task randomises gains and the start state, which then are not compared.
     """
     saved_layout, saved = checkpoint.manifest.get("layout"), checkpoint.manifest.get("deployment")
     if saved is not None and "actuator_models" not in saved and deployment["actuator_models"]:
@@ -322,9 +327,9 @@ def deployment_differences(checkpoint: Checkpoint, layout: object, deployment: A
 
 
 def _comparable_parts(deployment: Any, randomized: bool) -> dict[str, Any]:
-    """Return the entries of a deployment record that the checkpoint and the environment must have in common.
+    """Return the entries of a deployment record that must be equal in the checkpoint and the environment.
 
-    Formulas are left out, and settings of the physics engine. With `randomized`, so are gains and the start state.
+    Formulas and settings of the physics engine are left out; if `randomized`, also gains and the start state.
     """
     terms = {group: [_without_values(t) for t in found] for group, found in deployment["observations"].items()}
     rest = {key: deployment[key] for key in ("actuators", "commands", *(() if randomized else ("start",)))}

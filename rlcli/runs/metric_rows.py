@@ -1,4 +1,4 @@
-"""Reader of the file `metrics.jsonl` of a run, which has one row of metrics for each iteration.
+"""Read the file `metrics.jsonl` of a run, which has one row (line) of metrics for each iteration.
 
 The file may be untrusted, and a killed process may leave an incomplete last row.
 """
@@ -21,11 +21,13 @@ _LARGEST = 1e300
 
 
 def read_rows(run: Run, *, strict: bool = False) -> Iterator[dict[str, Any]]:
-    """Yield the rows of a run's metrics, the oldest first; an incomplete last line of a killed process is skipped.
+    """Yield the rows of a run's metrics as metric -> number, the oldest first; nothing if there is no file.
+
+    An incomplete last line, as a killed process leaves one, is skipped.
 
     Args:
         run: the run.
-        strict: raise an error at a corrupt line; otherwise log a warning, and stop before it.
+        strict: raise an error at a corrupt line; if false, log a warning, and leave out the line and all later ones.
 
     Raises:
         CheckpointError: if the file cannot be read or is too large, or at a corrupt line.
@@ -46,7 +48,7 @@ def read_rows(run: Run, *, strict: bool = False) -> Iterator[dict[str, Any]]:
                     raise CheckpointError(f"{run.metrics}:{number} is corrupt: not a row of metrics; delete this line")
                 else:
                     _log.warning(
-                        "%s:%d is not a row of metrics: the rows from there on are left out", file.name, number
+                        "%s:%d is not a row of metrics; the rows from there on are left out", file.name, number
                     )
                     return
     except FileNotFoundError:

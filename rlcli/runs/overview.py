@@ -1,6 +1,6 @@
-"""Summary of each run in a folder, with state, progress and scores, for `rlcli runs`.
+"""Summarise the runs in a folder, with state, progress and scores, for `rlcli runs`.
 
-The summaries are read from the files of the runs alone, which may be untrusted; thousands of runs take little
+The summaries are read from the ends of the runs' files, which may be untrusted, so that thousands of runs take little
 time.
 """
 
@@ -52,9 +52,9 @@ class Overview:
     """Number of iterations of the whole training."""
     step: int | None = None
     last: dict[str, float] = field(default_factory=dict)
-    """Values `return` and `success` of the newest iteration in which episodes ended."""
+    """Values `return` and `success` of the newest iteration that has them; empty before the first episode has ended."""
     best: dict[str, float] = field(default_factory=dict)
-    """Values `step`, `return` and `success` of the best evaluation during training."""
+    """Values `step`, `return` and `success` of the best evaluation during training; empty without evaluations."""
     evaluation: dict[str, Any] = field(default_factory=dict)
     """Values `step`, `episodes`, `return` and `success` of the newest checkpoint that `rlcli eval` has evaluated."""
     started: str | None = None
@@ -75,18 +75,18 @@ class Overview:
 
 
 def overviews(runs_dir: Path) -> list[Overview]:
-    """Return the summaries of all runs under a folder, the newest first; those without a start time come last."""
+    """Return the summaries of all runs in the folder of runs, the newest first; runs without a start time are last."""
     found = [overview(folder) for folder in run_folders(runs_dir)]
     return sorted(found, key=lambda run: (run.started or "", run.folder.name), reverse=True)
 
 
 def overview(folder: Path) -> Overview:
-    """Return the summary of a run's folder; if it cannot be read, the state is `broken` and `reason` the message."""
+    """Return the summary of a run's folder; if the run cannot be read, its state is `broken`, its reason the error."""
     try:
         run = open_run(folder)
     except (CheckpointError, OSError) as error:
         if _is_new(folder):
-            return Overview(folder, folder.parent.name, "running", "it is being created", age_s=0.0)
+            return Overview(folder, folder.parent.name, "running", "the run is being created", age_s=0.0)
         message = getattr(error, "message", None) or getattr(error, "strerror", None) or str(error)
         return Overview(folder, folder.parent.name, "broken", message, size_bytes=_size(folder))
     return overview_of(run)
@@ -125,12 +125,15 @@ def overview_of(run: Run) -> Overview:
     overview.evaluation = _evaluation(run)
     overview.age_s, overview.duration_s = times(run)
     if not (run.folder / CONFIG).is_file():
-        overview.state, overview.reason, overview.resumable = "broken", f"it has no {CONFIG}", False
+        overview.state, overview.reason, overview.resumable = "broken", f"the run has no {CONFIG}", False
     return overview
 
 
 def state_of(run: Run) -> tuple[str, str | None]:
-    """Return the state of a run, and the reason if it failed, diverged, was interrupted or is broken."""
+    """Return the state of a run (see `Overview.state`), and why it failed, diverged, was interrupted or is broken.
+
+    The reason is None for other states, or if it is not known.
+    """
     recorded = run.record.get("state", "")
     if is_locked(run.folder):
         return "running", None
@@ -143,7 +146,7 @@ def state_of(run: Run) -> tuple[str, str | None]:
     if recorded in ENDED or recorded == WAITING:
         return recorded, reason
     if recorded == "running":
-        return "interrupted", "its process was killed, or the machine stopped"
+        return "interrupted", "the process of the run was killed, or the machine stopped"
     return "broken", f"{RECORD} has the unknown state '{recorded[:40]}'"
 
 
@@ -190,7 +193,7 @@ def _row(line: bytes) -> dict[str, Any] | None:
 
 
 def _row_at(run: Run, step: int) -> dict[str, Any]:
-    """Return the row of metrics at an environment step; an empty mapping if there is none."""
+    """Return the row of metrics at an environment step, metric -> number; an empty dict if there is none."""
     data, _ = _tail(run, _MAX_SEARCH_BYTES)
     at = data.find(f'"step": {step},'.encode())
     line = b"" if at < 0 else data[data.rfind(b"\n", 0, at) + 1 : data.find(b"\n", at)]
@@ -223,12 +226,18 @@ def _evaluation(run: Run) -> dict[str, Any]:
 
 
 def as_count(value: object) -> int | None:
-    """Return a value of untrusted JSON as a number of steps or iterations; None if it is no integer >= 0, < 2**63."""
+    """Return a value of untrusted JSON if it is a valid number of steps or iterations (integer, 0 to 2**63 - 1).
+
+    Return None for any other value.
+    """
     return value if type(value) is int and 0 <= value < 2**63 else None
 
 
 def times(run: Run) -> tuple[float | None, float | None]:
-    """Return the time since the start of a run, and the time that it has trained [s]; None if the clock was changed."""
+    """Return the time since the start of a run [s], and the training time over all resumptions [s].
+
+    A time is None if the time stamps in the run cannot be right, for example because a clock was changed.
+    """
     started = seconds_since(run.record.get("started"))
     age = max(0.0, started) if -_STARTING_S < started < math.inf else None
     before, since = run.record.get("trained_s"), run.record.get("since")
@@ -244,7 +253,7 @@ def times(run: Run) -> tuple[float | None, float | None]:
 
 
 def _resumable(run: Run) -> bool:
-    """Return whether a run has a checkpoint to resume from, or was stopped before its first one."""
+    """Return whether a run has a checkpoint to resume from, or was stopped before its first checkpoint."""
     try:
         names = os.listdir(run.checkpoints)
     except OSError:

@@ -1,6 +1,6 @@
-"""Check of the pickle in a .pt file before torch reads it.
+"""Check the pickle in a .pt file before torch reads the file.
 
-It simulates the operations of the pickle without executing them, and refuses all that could run code.
+The operations of the pickle are simulated, not executed; operations that could run code are refused.
 """
 
 import pickletools
@@ -11,7 +11,7 @@ from typing import Any
 from rlcli.errors import CheckpointError, one_line
 
 MAX_BYTES = 4 * 2**20
-"""Largest pickle [bytes]; also the largest number of values in it, each counted as often as it is referred to."""
+"""Size limit of a pickle [bytes], and of the number of values in a pickle; a value counts at each reference to it."""
 _MAX_DEPTH = 100
 _MAX_KEY = 2**31
 """Integers from this size on are refused as dictionary keys: a file could have many keys with the same hash."""
@@ -30,15 +30,18 @@ SAVE_HINT = (
 
 @dataclass(slots=True, eq=False)
 class _Value:
-    """Value that a pickle would create; stores only the properties that decide whether later operations are safe."""
+    """Value that a pickle would create, with only the properties that decide whether later operations are safe."""
 
     kind: str = "other"
-    """`tuple`, `list`, `dict`, `other`, or the global name."""
+    """`tuple`, `list`, `dict`, `other`, or a name of `_ALLOWED`."""
     is_key: bool = False
+    """Whether the value may be a key of a dictionary."""
     depth: int = 0
+    """Number of levels of nested containers."""
     size: int = 1
+    """Number of values in the value, itself included."""
     stored: bool = False
-    """Whether another value contains this one. Then it must not grow: `depth` and `size` of the other would change."""
+    """Whether a container holds the value. The value must not grow any more: the container's `size` would be wrong."""
 
 
 @dataclass(slots=True)
@@ -54,7 +57,7 @@ class _Simulation:
         """Simulate one operation.
 
         Raises:
-            _RefusedError: if the operation could execute code, or make torch or rlcli hang or crash.
+            _RefusedError: if the operation could run code, or could make torch or rlcli hang or crash.
             IndexError, KeyError: if the pickle is corrupt.
         """
         stack = self.stack
@@ -154,7 +157,7 @@ def _result(function: str, arguments: _Value) -> _Value:
 
 
 class _RefusedError(Exception):
-    """Error for a pickle that is refused. The message is the rest of a sentence that starts with the file's name."""
+    """Error for a refused pickle; the message continues a sentence that begins with the name of the file."""
 
 
 def require_tensors_only(description: bytes, where: str) -> None:

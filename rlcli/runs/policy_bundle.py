@@ -1,7 +1,7 @@
-"""Policy bundles: small folders that ship a trained policy without the rest of its training.
+"""Write and read bundles: small folders that ship a trained policy without the state of its training.
 
 A bundle is a checkpoint reduced to `policy.json`, `policy.safetensors` and a manifest, which records the policy's task
-and training. It is read like any checkpoint, with the same checks.
+and training. A bundle is read like any checkpoint, with the same checks.
 """
 
 import os
@@ -27,7 +27,7 @@ BUNDLE = 1
 
 
 class _BundleRecord(FileModel):
-    """Entries that only the manifest.json of a bundle has, and not that of a run's checkpoint."""
+    """Entries that the manifest.json of a bundle must have, unlike that of a run's checkpoint."""
 
     task: TaskRecord
     agent: Annotated[PrintableText, Field(max_length=200)] | None = None
@@ -51,7 +51,7 @@ def open_bundle(folder: Path) -> Checkpoint:
     In the manifest, `task` is the record of the policy's task (`TaskSource.record`), and `agent` the agent's name.
 
     Raises:
-        CheckpointError: if the folder is not a bundle, or a bundle of another version.
+        CheckpointError: if the folder is not a valid bundle, or its version is not the one that this rlcli reads.
     """
     bundle = open_checkpoint(folder)
     version = bundle.manifest.get("bundle")
@@ -63,10 +63,10 @@ def open_bundle(folder: Path) -> Checkpoint:
 
 
 def check_bundle_target(output: Path) -> None:
-    """Check that a bundle can be written to a path: a new or empty folder, or an older bundle.
+    """Check that a bundle can be written to a path: there is nothing yet, an empty folder, or an older bundle.
 
     Raises:
-        UsageError: if the path holds anything else.
+        UsageError: if there is anything else.
     """
     if not output.name:
         raise UsageError(f"--output {output} has no folder name", hint="give --output FOLDER")
@@ -86,7 +86,8 @@ def write_bundle(
     Args:
         checkpoint: the checkpoint.
         output: the folder; an older bundle in it is replaced.
-        run: the run of the checkpoint, which records the hardware and duration of the training.
+        run: the run of the checkpoint, which records the hardware and duration of the training; None: the checkpoint's
+            own entry `origin`, if it has one.
         evaluation: the result of `rlcli eval` for this checkpoint; None: the checkpoint's own entry, if it has one.
 
     Raises:
@@ -160,7 +161,7 @@ def _require_same_policy(checkpoint: Checkpoint, fresh: Path, output: Path) -> N
     if before.spec != after.spec or not all(torch.equal(value, written) for value, written in pairs):
         raise VerdictError(
             f"{output} is not kept: the policy read back from it differs from the policy of {checkpoint.folder};"
-            " export it again, and report the bug if this repeats"
+            " export the policy again, and report the bug if this repeats"
         )
 
 

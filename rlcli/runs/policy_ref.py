@@ -1,7 +1,6 @@
-"""References to policies on a command line: a checkpoint of a run, or a bundle.
+"""Find the policy that a command line names: a checkpoint of a run, a bundle, or the policy shipped with a task.
 
-A bundle is a folder with a policy alone, which `rlcli export --format bundle` writes; the policy shipped with a task is
-one.
+A bundle is a folder with a policy alone, which `rlcli export --format bundle` writes. Shipped policies are bundles.
 """
 
 import os
@@ -28,10 +27,11 @@ class Choice:
 
     folder: Path
     why: str
+    """The reason for the choice, as text for the user, such as `as named`."""
     run: Run | None
     """The run of a checkpoint; None for a bundle, and for a checkpoint folder outside a run."""
     bundle: Checkpoint | None
-    """The bundle; None for a checkpoint of a run."""
+    """The bundle; None for any other checkpoint."""
 
     @property
     def agent(self) -> str | None:
@@ -39,14 +39,14 @@ class Choice:
         return None if self.bundle is None else self.bundle.manifest.get("agent")
 
     def source(self, named: TaskSource | None) -> TaskSource:
-        """Return the task of the policy: a run's task as it was trained, or a bundle's installed task.
+        """Return the task of the policy: for a run its recorded configuration, for a bundle the installed task.
 
         Args:
-            named: the task on the command line, if there is one.
+            named: the task on the command line; None: no task was named.
 
         Raises:
             TaskError: if the task is not installed.
-            CheckpointError: if the task is neither installed nor named.
+            CheckpointError: if the task is not trusted, or is neither installed nor named.
         """
         if self.run is not None:
             return source_of(self.run, named)
@@ -56,7 +56,8 @@ class Choice:
             return named
         if not record.get("distribution"):
             message = f"{self.folder} is a policy for '{record['name']}', which was not an installed task"
-            raise CheckpointError(message, hint=f"name its folder: `rlcli play FOLDER --checkpoint {self.folder}`")
+            hint = f"name the folder of the task: `rlcli play FOLDER --checkpoint {self.folder}`"
+            raise CheckpointError(message, hint=hint)
         return recorded_task(record, f"the task of {self.folder}")
 
 
@@ -74,12 +75,12 @@ def choose(
     Args:
         reference: RUN, RUN@best, RUN@step:N, a folder, `latest` or `shipped`.
         runs_dir: the folder of runs.
-        named: the task on the command line, if there is one.
-        any_task: accept a policy of another task.
+        named: the task on the command line; None: no task was named.
+        any_task: whether a policy of another task is accepted.
 
     Raises:
         CheckpointError: if there is no such policy.
-        UsageError: if the policy is for another task.
+        UsageError: if the policy is for another task than `named`, or `shipped` is given without a task.
     """
     name = None if named is None or any_task else named.name
     if reference == SHIPPED or (reference is None and _has_only_shipped(named, runs_dir)):

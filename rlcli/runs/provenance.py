@@ -1,6 +1,6 @@
-"""Record of a run's software and hardware: versions, source code, processor; they may change its results.
+"""Record the software and hardware of a run, which may change its results: versions, source code, processor, threads.
 
-The record is stored in run.json, so that a later run can be compared with this one.
+The record is stored in run.json; `rlcli diff` and `rlcli reproduce` compare it with that of another run or machine.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ ENTRIES = (
     "rlcli", "python", "machine", "libc", "versions", "sources", "cpu", "variables", "engine_threads", "torch_threads",
     "device", "processes", "torch", "model",
 )  # fmt: skip
-"""Entries of run.json that are compared. The others (command, pid, platform, times) do not affect the results."""
+"""Entries of run.json that `differences` compares. The others (command, pid, platform, times) do not affect results."""
 
 _ASSETS = re.compile(rb"""\bfile\s*=\s*["']([^"']{1,500})["']""")
 _FOLDERS = re.compile(rb"""\b(?:meshdir|texturedir|assetdir)\s*=\s*["']([^"']{0,500})["']""")
 _MAX_FILES = 256
 _MAX_BYTES = 64 * 1024**2
-"""Largest total size of a task's files that are hashed [bytes]. The hash of the compiled model covers further files."""
+"""Limit of the total size of a task's files that are hashed [bytes]. The hash of the compiled model covers the rest."""
 
 
 def environment_record(resolved: Resolved, engine_threads: int, torch_threads: int) -> dict[str, Any]:
@@ -102,7 +102,8 @@ def built_record(model: mujoco.MjModel, device: str) -> dict[str, Any]:
 def versions(resolved: Resolved) -> dict[str, str]:
     """Return the versions of all packages that may change the results, by the name of the package.
 
-    These are `PACKAGES`, the packages of the task, of the trainer and of the task's format, and what they require.
+    The packages are `PACKAGES`, those of the task, of the trainer and of the task's format, and their requirements. A
+    package that is not installed has an empty version.
     """
     found = {name: _version(name) for name in PACKAGES}
     owners = []
@@ -124,7 +125,7 @@ def versions(resolved: Resolved) -> dict[str, str]:
 
 
 def sources(resolved: Resolved) -> dict[str, str]:
-    """Return SHA-256 hashes, by name: of each file of the task, of rlcli's source code and of the task's format's."""
+    """Return SHA-256 hashes by name: of each file of the task, and of the code of rlcli and of the task's format."""
     root = resolved.source.root.resolve()
     digests = {}
     for file in _task_files(resolved):
@@ -166,7 +167,9 @@ def model_digest(model: mujoco.MjModel) -> str:
 
 
 def differences(was: Mapping[str, Any], now: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
-    """Return (dotted name, old value, new value) of each entry that two records have and that differs.
+    """Return (dotted name, old value, new value) of each entry whose values differ between two records.
+
+    Entries of `ENTRIES` that a record lacks are not compared.
 
     Args:
         was: a record of this module, such as the record of a run.
@@ -214,7 +217,7 @@ def _task_files(resolved: Resolved) -> Iterator[Path]:
 
 
 def _assets_of(model: Path) -> Iterable[Path]:
-    """Return the files that an MJCF may refer to: each asset in the model's folder and in each of its asset folders."""
+    """Return paths of files that an MJCF may refer to: each asset's name in the MJCF's folder and its asset folders."""
     text = model.read_bytes()
     folders = ["", *(os.fsdecode(name) for name in _FOLDERS.findall(text))]
     names = dict.fromkeys(os.fsdecode(name) for name in _ASSETS.findall(text))

@@ -1,6 +1,6 @@
-"""Functions for `rlcli reproduce`, which trains a run again and compares the results.
+"""Prepare `rlcli reproduce`, which trains a run again and compares the results.
 
-They check that the run can be reproduced, and create the folder of the new run.
+The functions check that the run can be reproduced, and create the folder of the new run.
 """
 
 from collections.abc import Mapping
@@ -32,7 +32,8 @@ def require_reproducible(run: Run) -> None:
             hint="train again with other seeds, and compare the policies with `rlcli eval`",
         )
     if processes != 1:
-        raise UsageError(f"{run.folder} was trained by {processes} processes; choose a run of one process")
+        message = f"{run.folder} was trained by {processes} processes, and only runs of one process can be reproduced"
+        raise UsageError(message, hint="choose another run")
     if last_iteration(run) < 1:
         raise UsageError(f"{run.folder} has no finished iteration to reproduce; choose another run")
 
@@ -45,13 +46,16 @@ def changed_entries(run: Run, now: Mapping[str, Any]) -> list[tuple[str, Any, An
         now: the record of the present software and machine, from `rlcli.runs.provenance`.
 
     Returns:
-        (name, value in run.json, present value) of each.
+        (dotted name, value in run.json, present value) of each changed entry.
     """
     return [row for row in differences(run.record, now) if row[0] not in IRRELEVANT]
 
 
 def milestones(run: Run, until: int) -> list[int]:
-    """Return the iterations at which a reproduction is compared: those with a checkpoint below `until`, and `until`."""
+    """Return the iterations at which a reproduction is compared with the run, ascending.
+
+    They are the iterations before `until` at which the run has a checkpoint, and `until` itself.
+    """
     saved = [open_checkpoint(run.checkpoints / f"{step:012d}").manifest for step in steps(run.checkpoints)]
     iterations = [entry["iteration"] for entry in saved if isinstance(entry.get("iteration"), int)]
     return sorted({i for i in iterations if 0 < i < until} | {until})
@@ -70,7 +74,7 @@ def create_reproduction(original: Run, runs_dir: Path, name: str, now: Mapping[s
         The new run, and the checkpoint with the initial weights of both runs; None for random weights.
 
     Raises:
-        CheckpointError: if the checkpoint with the initial weights has changed since then.
+        CheckpointError: if the checkpoint with the initial weights has changed since the original run started.
     """
     was = original.record
     initial = Path(was["init_from"]) if was.get("init_from") else None

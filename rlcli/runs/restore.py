@@ -1,6 +1,6 @@
-"""Functions that find the task and configuration of a saved run, and check that a checkpoint fits an environment.
+"""Find the task and configuration of a saved run, and check that a checkpoint fits an environment.
 
-Commands that use a trained policy call them, such as `play`, `eval` and `train --resume`.
+Commands that use a trained policy call these functions, such as `play`, `eval` and `train --resume`.
 """
 
 import os
@@ -50,7 +50,7 @@ def recorded_task(
     Args:
         record: the record.
         what: name of the task in messages, such as `the task of RUN`.
-        run: the run that holds the record, if there is one.
+        run: folder of the run that holds the record, for the message; None: another file holds the record.
         named: the task on the command line, which replaces a task in a folder; see `source_of`.
 
     Raises:
@@ -77,7 +77,9 @@ def recorded_task(
         return folder_task(Path(str(record["folder"])), file)
     except TaskError as error:
         version = f" {record['version']}" if record.get("version") else ""
-        folder = "" if run is None else f"; or name its folder: rlcli play FOLDER --checkpoint {shlex.quote(run)}"
+        folder = (
+            "" if run is None else f"; or name the task's folder: rlcli play FOLDER --checkpoint {shlex.quote(run)}"
+        )
         hint = f"if you trust its authors, install {owner}{version}{folder}" if owner else error.hint
         raise TaskError(f"{what} is not installed: {error.message}", hint=hint) from None
 
@@ -98,8 +100,12 @@ def resolve_run(
     Args:
         run: the run.
         play: whether to apply the task's `play:` changes.
-        flags: dotted key -> value.
+        flags: dotted key -> value that replaces the recorded value; None: no changes.
         named: the task on the command line, which replaces a task in a folder; see `source_of`.
+
+    Raises:
+        TaskError, CheckpointError: see `source_of`.
+        ConfigError: if the installed task does not accept the configuration.
     """
     return resolve(source_of(run, named), play=play, flags=flags)
 
@@ -108,7 +114,7 @@ def require_fit(checkpoint: Checkpoint, layout: Layout) -> None:
     """Check that an environment has the observations, actions and control period that a policy was trained with.
 
     Raises:
-        CheckpointError: with a table of the differences.
+        CheckpointError: if they differ, with a table of the differences.
     """
     saved, file = checkpoint.manifest.get("layout"), checkpoint.folder / "manifest.json"
     check_json(_SavedLayout, saved, file, "layout", hint="use another checkpoint: RUN@step:N")
@@ -141,10 +147,12 @@ class _SavedLayout(FileModel):
 
 
 def require_trainer(checkpoint: Checkpoint, trainer: str) -> None:
-    """Check that a run is resumed by the trainer that saved it; checkpoints of older versions do not record it.
+    """Check that the trainer that resumes a run is the trainer that saved the checkpoint.
+
+    Checkpoints of older versions of rlcli do not record their trainer and are accepted.
 
     Raises:
-        CheckpointError: with both trainers.
+        CheckpointError: if the trainers differ; the message names both.
     """
     saved = checkpoint.manifest.get("trainer")
     if saved is not None and saved != trainer:
@@ -153,10 +161,15 @@ def require_trainer(checkpoint: Checkpoint, trainer: str) -> None:
 
 
 def require_same_policy(checkpoint: Checkpoint, policy: Policy, trainer: str) -> None:
-    """Check that the weights of a checkpoint fit a policy. The two may differ in the bounds of actions.
+    """Check that the weights of a checkpoint fit an agent's policy; the bounds of actions may differ.
+
+    Args:
+        checkpoint: the checkpoint.
+        policy: the policy of the agent that gets the weights.
+        trainer: name of the agent's trainer, for the message.
 
     Raises:
-        CheckpointError: with a table of the differences.
+        CheckpointError: if the structures of the policies differ, with a table of the differences.
     """
     saved, wanted = checkpoint.policy().spec.model_dump(), policy.spec.model_dump()
     rows = [(key, str(saved[key]), str(wanted[key])) for key in wanted if saved[key] != wanted[key]]
@@ -219,9 +232,7 @@ _CONTRACT = ("name", "size", "elements", "scale", "offset", "clip", "history", "
 def _differ(was: Mapping[str, Any] | None, now: Mapping[str, Any] | None) -> bool:
     """Return whether the layout of a term in a checkpoint, `was`, differs from that in the environment, `now`.
 
-    Only keys that both layouts have are compared.
-
-    Checkpoints of older versions lack some keys.
+    Only keys that both layouts have are compared: checkpoints of older versions of rlcli lack some keys.
     """
     if was is None or now is None:
         return True
@@ -242,7 +253,10 @@ def _text(term: Mapping[str, Any] | None) -> str:
 
 
 def _rounded(value: object) -> Any:
-    """Return a number, or a list of numbers, as text with six digits: further digits depend on the machine."""
+    """Return a float, or a list, as text with six significant digits: further digits depend on the machine.
+
+    Other values are returned unchanged.
+    """
     if isinstance(value, list):
         return "[" + ", ".join(str(_rounded(item)) for item in value) + "]"
     return f"{value:.6g}" if isinstance(value, float) else value

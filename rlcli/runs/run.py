@@ -1,6 +1,6 @@
-"""Class `Run`, the folder of one training, with configuration, record (run.json), metrics and checkpoints.
+"""Create, open, lock and find runs: folders of one training with configuration, run.json, metrics and checkpoints.
 
-The process that writes to a run locks it. Content of a downloaded run is untrusted and is checked.
+The process that writes to a run locks the run. The files of a downloaded run are untrusted and are checked.
 """
 
 import contextlib
@@ -52,12 +52,13 @@ _NAME = re.compile(r"[A-Za-z0-9][\w.-]*", re.ASCII)
 
 @dataclass(slots=True)
 class Run:
-    """Folder of one training run. `record` is the content of run.json: its task, seed, state and environment."""
+    """Folder of one training."""
 
     folder: Path
     """The folder; absolute after `lock`, so that writing does not depend on the current folder, which a task may
     change."""
     record: dict[str, Any] = field(default_factory=dict)
+    """Content of run.json: task, seed, state, software and hardware, and so on."""
     _lock: RunLock | None = None
     shown: Path = field(init=False)
     """The folder as it was given, for messages."""
@@ -99,7 +100,11 @@ class Run:
         return [f"{each['check']}: {each['message']}; try {each['hint']}" for each in self.record.get("health", ())]
 
     def update(self, **entries: Any) -> None:
-        """Change entries of `record`, and write run.json."""
+        """Change entries of `record`, and write run.json.
+
+        Raises:
+            MachineError: if the disk reports an error, or this process has lost the lock of the run.
+        """
         self.record.update(entries)
         write_atomic(self.folder / RECORD, to_json(self.record))
 
@@ -121,7 +126,7 @@ class Run:
             self._lock.release()
 
     def discard(self) -> None:
-        """Delete a run that has not started, if no other process may be writing to it."""
+        """Delete a run whose training did not start, if this process still holds the lock; then release the lock."""
         with contextlib.suppress(MachineError):
             require_lock(self.folder)
             shutil.rmtree(self.folder, ignore_errors=True)
@@ -173,7 +178,8 @@ def require_name(name: str | None) -> None:
         hint = "begin with a letter or digit; then letters, digits, '.', '-' and '_' are allowed"
         raise UsageError(f"--name '{name}' cannot be part of a folder's name", hint=hint)
     if name is not None and len(name) > MAX_NAME:
-        raise UsageError(f"--name has {len(name)} characters; at most {MAX_NAME} are allowed", hint="shorten it")
+        message = f"--name has {len(name)} characters; at most {MAX_NAME} are allowed"
+        raise UsageError(message, hint="shorten the name")
 
 
 def initialize_run(folder: Path, config: str, record: Mapping[str, Any]) -> Run:
@@ -212,16 +218,16 @@ def open_run(folder: Path) -> Run:
     require_plain_run(folder)
     for part in (folder / CONFIG, folder / "metrics.jsonl"):
         if part.is_dir():
-            raise CheckpointError(f"{part} is not a regular file; move it out of the run")
+            raise CheckpointError(f"{part} is a folder, but must be a file; move the folder out of the run's folder")
     check_json(RunRecord, record, folder / RECORD)
     return Run(folder, record)
 
 
 def require_plain_run(folder: Path) -> None:
-    """Check that the folders of a run into which rlcli writes contain only regular files and folders.
+    """Check that the folders of a run into which a training writes contain only regular files and folders.
 
     Raises:
-        CheckpointError: with the first other entry.
+        CheckpointError: for the first entry that is a link, a pipe or a device.
     """
     for inner in ("", "checkpoints", "checkpoints/logs"):
         if (folder / inner).is_dir():
@@ -239,7 +245,7 @@ def run_folders(runs_dir: Path) -> Iterator[Path]:
 
 
 def runs_below(folder: Path, depth: int = 3) -> Iterator[Path]:
-    """Yield the runs in a folder of runs, of a task or of a study."""
+    """Yield the folders of the runs in a folder of runs, of a task or of a study; search at most `depth` levels."""
     for below in _subfolders(folder):
         if (below / RECORD).is_file():
             yield below
@@ -274,7 +280,7 @@ def require_own(run: Run, *parts: str) -> None:
         parts: files and folders in the run; a folder stands for everything in it.
 
     Raises:
-        CheckpointError: with the first path that must not be in a run.
+        CheckpointError: for the first path that is a link out of the run, a pipe or a device.
     """
     count = 0
     pending = [run.folder / part for part in parts]
@@ -292,11 +298,11 @@ def require_own(run: Run, *parts: str) -> None:
             continue
         except (OSError, RuntimeError) as error:
             reason = getattr(error, "strerror", None) or error
-            message, hint = f"{path} cannot be part of a run: {reason}", "move it out of the run"
+            message, hint = f"{path} cannot be part of a run: {reason}", "move it out of the run's folder"
             raise CheckpointError(message, hint=hint) from None
         if count > _MAX_FILES:
             message = f"{run.folder} has more than {_MAX_FILES} files"
-            raise CheckpointError(message, hint="move files that are not rlcli's to another folder")
+            raise CheckpointError(message, hint="move files that rlcli did not write to another folder")
 
 
 def _require_task_name(name: str) -> str:
@@ -334,7 +340,7 @@ class _Finding(FileModel):
 
 
 def seconds_since(stamp: object) -> float:
-    """Return the seconds since an ISO time stamp, negative for one in the future; infinity if it is malformed."""
+    """Return the seconds since an ISO time stamp, negative if the stamp is in the future; infinity if malformed."""
     try:
         return time.time() - datetime.fromisoformat(str(stamp)).timestamp()
     except (ValueError, OverflowError, OSError):
@@ -369,7 +375,7 @@ class RunRecord(FileModel):
 
 
 def _create_numbered_folder(parent: Path, stem: str) -> Path:
-    """Create the folder `stem`, or `stem-2`, `stem-3`, ... if it exists."""
+    """Create and return the folder `stem` in `parent`, or `stem-2`, `stem-3`, ... if `stem` exists."""
     for attempt in range(1, 10_000):
         folder = parent / (stem if attempt == 1 else f"{stem}-{attempt}")
         with contextlib.suppress(FileExistsError):

@@ -1,4 +1,4 @@
-"""Comparison of two runs by their files: configuration, environment, metrics, weights and policy.
+"""Compare two runs by their files: configuration, software and hardware, metrics, weights and policy.
 
 `rlcli diff` and `rlcli reproduce` print the result.
 """
@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     from rlcli.runs.checkpoint_reader import Checkpoint
 
 SECTIONS = ("configuration", "environment", "metrics", "weights", "policy")
-"""Parts of two runs that are compared, in this order: a difference in one part may cause those in later parts."""
+"""Parts of two runs that are compared, in this order: a difference in one part may cause differences in later parts.
+`environment` is the software and hardware."""
 _CLOCK = "Perf/"
 """Prefix of metrics that measure time, which are never equal."""
 _ROWS = 4096
@@ -63,7 +64,11 @@ def first_difference(sections: Iterable[Section]) -> tuple[str, Difference] | No
 
 
 def last_iteration(run: Run) -> int:
-    """Return the index of the last iteration in a run's metrics; 0 if there is none."""
+    """Return the number of the last iteration in a run's metrics, counted from 1; 0 if the run has no metrics.
+
+    Raises:
+        CheckpointError: if metrics.jsonl has a corrupt line.
+    """
     return max((row["iteration"] for row in read_rows(run, strict=True)), default=0)
 
 
@@ -112,7 +117,7 @@ def _weights(left: Run, right: Run, until: int | None) -> Section:
 
 
 def _checkpoint_differences(left: Run, right: Run, steps: Sequence[int]) -> Iterator[Difference]:
-    """Yield the differences between the checkpoints of two runs at these environment steps, in this order."""
+    """Yield the differences between the checkpoints of two runs at some environment steps, in this order."""
     for step in steps:
         one, other = (_open_checkpoint(run, step) for run in (left, right))
         for part in _parts(one, other):
@@ -200,7 +205,7 @@ def _compare_values(one: Checkpoint, other: Checkpoint) -> Iterator[Difference]:
 
 
 def _first_unequal(left: Mapping[Any, Any], right: Mapping[Any, Any], keys: Iterable[Any]) -> Any:
-    """Return the first key whose values differ; None if all are equal."""
+    """Return the first of `keys` whose values differ between two mappings; None if all are equal."""
     return next((key for key in keys if as_text(left.get(key)) != as_text(right.get(key))), None)
 
 

@@ -1,4 +1,4 @@
-"""Lock of a run's folder: only the process that holds the lock may write there.
+"""Lock of a run's folder: only the process that holds the lock may write to the run.
 
 Each write checks the lock first, because the folder may have been deleted or moved.
 """
@@ -18,7 +18,7 @@ _TIMEOUT_S = 0.3
 
 
 class RunLock:
-    """Lock of a folder. The system releases it when the process ends.
+    """Lock of a folder, by a lock on its file `.lock`. The operating system releases it when the process ends.
 
     Args:
         folder: the folder.
@@ -30,16 +30,17 @@ class RunLock:
         self._identity = (0, 0)
 
     def acquire(self) -> None:
-        """Take the lock.
+        """Take the lock; wait at most `_TIMEOUT_S` for another process.
 
         Raises:
-            MachineError: if another process has it.
-            OSError: if the file cannot be opened.
+            MachineError: if another process holds the lock.
+            OSError: if the lock file cannot be opened.
         """
         try:
             self._lock.acquire()
         except Timeout:
-            raise MachineError(f"another process writes to {self.folder}; wait for its end") from None
+            message = f"another process writes to {self.folder}; wait until that process has ended"
+            raise MachineError(message) from None
         self._identity = _identity(self._file)
         _held[self.folder] = self
 
@@ -52,10 +53,11 @@ class RunLock:
     def require(self) -> None:
         """Check that the lock file is still the file that this process has locked.
 
-        It is another one if the file was deleted, or if the folder was moved away and another folder is in its place.
+        The lock is lost if the file was deleted, or if the folder was moved away and another folder is in its place: a
+        second process could then lock the folder, too.
 
         Raises:
-            MachineError: if the lock file is another one: a second process could then lock the folder, too.
+            MachineError: if the lock is lost.
             OSError: if the folder does not exist any more.
         """
         try:
@@ -67,7 +69,7 @@ class RunLock:
         if not is_ours:
             cause = f"{self._file.name} was deleted or the folder was replaced"
             message = f"this process has lost the lock of {self.folder}: {cause}"
-            hint = "wait for the end of any other process that writes there"
+            hint = "wait until no other process writes to the folder, then start again"
             raise MachineError(f"{message}, and nothing more is written", hint=hint)
 
 
@@ -100,13 +102,13 @@ def is_locked(folder: Path) -> bool:
 
 
 def _identity(file: Path) -> tuple[int, int]:
-    """Return the device and the inode of a file, which no other file has while this one is open."""
+    """Return the device and the inode of a file; while a file is open, no other file has the same pair."""
     found = os.stat(file)
     return found.st_dev, found.st_ino
 
 
 def _can_share(handle: int) -> bool:
-    """Return whether no process holds the lock, by an attempt to take a shared lock of the open lock file.
+    """Return whether a shared lock of the open lock file can be taken, which means that no process holds the lock.
 
     The shared lock ends when the handle is closed.
     """

@@ -1,6 +1,6 @@
-"""Search for the run or checkpoint that a command line names.
+"""Find the run or checkpoint that a command line names.
 
-The name is a folder, the name of a run, `latest`, `RUN@best` or `RUN@step:N`.
+A reference is a folder, the name of a run, `latest`, `RUN@best` or `RUN@step:N`.
 """
 
 import glob
@@ -19,10 +19,10 @@ _log = logging.getLogger(__name__)
 
 
 def find_run(reference: str, runs_dir: Path, task: str | None = None) -> tuple[Run, str]:
-    """Find a run by its folder, its name, or `latest`; return it and the reason for the choice, as text.
+    """Find a run by its folder, its name, or `latest`; return the run and the reason for the choice, as text.
 
     Args:
-        reference: the folder, the name, or `latest`.
+        reference: the folder, the name, or `latest` (the run that was started last).
         runs_dir: the folder of runs.
         task: name of the task that the run must have; None: any.
 
@@ -37,7 +37,10 @@ def find_run(reference: str, runs_dir: Path, task: str | None = None) -> tuple[R
 
 
 def is_same_task(name: str, other: str) -> bool:
-    """Return whether two names may be of one task: `pick-crane` is installed, and its folder is `pick_crane`."""
+    """Return whether two names may be of one task: they are equal but for `-` and `_`.
+
+    The installed task `pick-crane`, for example, has the folder `pick_crane`.
+    """
     return name.replace("-", "_") == other.replace("-", "_")
 
 
@@ -48,7 +51,9 @@ def is_checkpoint_ref(reference: str) -> bool:
 
 
 def find_runs(references: list[str], runs_dir: Path) -> list[Run]:
-    """Find the runs of several references: a folder, a name, `latest`, a task, or a folder of runs.
+    """Find the runs of several references, each of which may name several runs.
+
+    A reference is the folder or name of a run, `latest`, a task, a study, or a folder of runs.
 
     Raises:
         CheckpointError: if a reference names no run, or only broken ones.
@@ -67,7 +72,7 @@ def find_runs(references: list[str], runs_dir: Path) -> list[Run]:
 
 
 def _runs_of_task(reference: str, runs_dir: Path) -> list[Run]:
-    """Return the runs of a task or of a folder of runs; an empty list if the reference names one run."""
+    """Return the runs of a task, a study or a folder of runs; an empty list if the reference names a single run."""
     if reference == "latest" or (path_of(reference) / RECORD).is_file():
         return []
     found, refused = _list_runs(runs_dir, reference.rpartition(":")[2])
@@ -108,7 +113,7 @@ def _warn_of_skipped(refused: list[CheckpointError]) -> None:
 
 
 def _opened(folders: Iterable[Path]) -> tuple[list[Run], dict[Path, CheckpointError]]:
-    """Open the runs in some folders; return them, the oldest first, and the error of each broken one."""
+    """Open the runs in some folders; return the runs, the oldest first, and the error of each broken run by folder."""
     runs, refused = [], {}
     for folder in folders:
         try:
@@ -130,7 +135,7 @@ def find_checkpoint(
         reference: the reference.
         runs_dir: the folder of runs.
         task: name of the task that the run must have; None: any. It is not checked for the folder of a checkpoint.
-        whole: whether the whole checkpoint must be valid, so that it can be resumed; otherwise only its policy.
+        whole: whether the whole checkpoint must be valid, so that it can be resumed; false: only its policy.
 
     Returns:
         The run, the checkpoint's folder, and the reason for the choice.
@@ -148,7 +153,8 @@ def find_checkpoint(
     run, why = find_run(name, runs_dir, task)
     have = steps(run.checkpoints)
     if not have:
-        raise CheckpointError(f"{run.folder} has no complete checkpoint; run `rlcli train` to make one")
+        message = f"{run.folder} has no complete checkpoint"
+        raise CheckpointError(message, hint="choose another run, or train again with `rlcli train`")
     if not which:
         return run, *_newest_valid(run, have, why, whole)
     if which == "best":
@@ -164,12 +170,12 @@ def find_checkpoint(
         if int(number) not in have:
             raise CheckpointError(
                 f"{run.folder} has no checkpoint at step {number}",
-                hint=f"it has checkpoints at these steps: {listing(map(str, have))}",
+                hint=f"the run has checkpoints at these steps: {listing(map(str, have))}",
             )
         return run, run.checkpoints / f"{int(number):012d}", "as named"
     raise CheckpointError(
         f"'{reference}' does not name a checkpoint",
-        hint="write RUN, RUN@best, RUN@step:N, a checkpoint folder, or latest",
+        hint="write RUN, RUN@best, RUN@step:N, the folder of a checkpoint, or latest",
     )
 
 
@@ -178,9 +184,9 @@ def _newest_valid(run: Run, have: list[int], why: str, whole: bool) -> tuple[Pat
 
     Args:
         run: the run.
-        have: environment steps of its checkpoints.
+        have: environment steps of the run's checkpoints, ascending.
         why: the reason why the run was chosen.
-        whole: whether the whole checkpoint must be valid, or only its policy.
+        whole: whether the whole checkpoint must be valid; false: only its policy.
 
     Raises:
         CheckpointError: if no checkpoint is valid, the newest valid one has another format, or it is the untrained
@@ -254,7 +260,7 @@ def _find_run(reference: str, runs_dir: Path, task: str | None) -> tuple[Run, st
         if os.path.isfile(candidate / STUDY):
             inside = sorted(file.parent.name for file in candidate.glob(f"*/{RECORD}"))
             message = f"{candidate} is a study of several runs"
-            draws = f"`rlcli plot {candidate}` draws all of them"
+            draws = f"`rlcli plot {candidate}` plots all of its runs"
             first = f"name one, such as {candidate / inside[0]} ({listing(inside)}); " if inside else ""
             raise CheckpointError(message, hint=first + draws)
     runs, broken = _opened(run_folders(runs_dir))

@@ -1,4 +1,4 @@
-"""Safe reading of untrusted files, such as those of a downloaded run.
+"""Read untrusted files safely, such as those of a downloaded run.
 
 Sizes are limited, links and pipes are refused, and JSON is parsed strictly and validated with pydantic models.
 """
@@ -59,7 +59,8 @@ def check_json(kind: type[Model], value: object, file: Path, *keys: str, hint: s
         hint: the hint of the error.
 
     Raises:
-        CheckpointError: with the key of the first problem, the value found, and what is allowed.
+        CheckpointError: if the value does not fit the model; the message has the key of the first problem, the value
+            found, and what is allowed.
     """
     try:
         return kind.model_validate_json(json.dumps(value))  # strict models accept a list for a tuple only in JSON
@@ -84,7 +85,10 @@ def _find_half_character(value: object, path: tuple[str | int, ...] = ()) -> str
 
 @contextlib.contextmanager
 def read_errors(file: Path) -> Iterator[None]:
-    """Turn an OSError inside the block, except a FileNotFoundError, into a CheckpointError that names the file."""
+    """Turn an OSError inside the `with` block into a CheckpointError that names the file.
+
+    A FileNotFoundError is raised unchanged.
+    """
     try:
         yield
     except FileNotFoundError:
@@ -94,17 +98,17 @@ def read_errors(file: Path) -> Iterator[None]:
 
 
 def read_file(file: Path, limit: int, *, size: int | None = None, missing: str | None = None) -> bytes:
-    """Return the content of a regular file. Check these bytes, and do not read the file again: it may change.
+    """Return the content of a regular file. Callers check these bytes and never read the file again: it may change.
 
     Args:
         file: the file.
         limit: largest size [bytes]; a larger file is not read at all.
         size: the size that the file must have [bytes]; None: any.
-        missing: message of the error if the file does not exist; None: a FileNotFoundError.
+        missing: message of the CheckpointError if the file does not exist; None: raise FileNotFoundError.
 
     Raises:
         CheckpointError: if the file is a link, not a regular file, too large or of another size, or cannot be read.
-        FileNotFoundError: if the file does not exist.
+        FileNotFoundError: if the file does not exist and `missing` is None.
     """
     try:
         with _opened(file) as (opened, found):
@@ -120,12 +124,12 @@ def read_file(file: Path, limit: int, *, size: int | None = None, missing: str |
 
 
 def manifest_error(file: Path, difference: str) -> CheckpointError:
-    """Return the error for a file of a checkpoint that differs from manifest.json; `difference` says how."""
+    """Return the error for a file of a checkpoint that differs from manifest.json; `difference` is what differs."""
     return CheckpointError(f"{file} is corrupt: {difference}", hint="choose an older checkpoint: RUN@step:N")
 
 
 def read_tail(file: Path, limit: int) -> tuple[bytes, bool]:
-    """Read the last `limit` bytes of a plain file that may be growing.
+    """Read the last `limit` bytes of a regular file that another process may be writing.
 
     Returns:
         The bytes, and whether they are the whole file.
@@ -145,7 +149,7 @@ def _opened(file: Path) -> Iterator[tuple[BinaryIO, int]]:
     """Open a regular file for a `with` block, which receives the open file and its size [bytes].
 
     Raises:
-        CheckpointError: with the name of the file, if it is a link or no regular file, or for an error in the block.
+        CheckpointError: if the file is a link or not a regular file, or if reading in the block fails.
         FileNotFoundError: if the file does not exist.
     """
     try:
@@ -171,7 +175,7 @@ def parse_json(data: bytes | str, file: Path) -> dict[str, Any]:
     """Parse a JSON object strictly: unique keys, finite numbers with at most 20 digits, at most 32 levels of nesting.
 
     Raises:
-        CheckpointError: if the text is not such an object; the message names the file.
+        CheckpointError: if the text is not such an object; the message names `file`.
     """
     try:
         text = data if isinstance(data, str) else data.decode()
@@ -197,13 +201,13 @@ def read_json(folder: Path, name: str, limit: int = JSON_LIMIT, *, missing: str 
 
     Args:
         folder: the folder.
-        name: path of the file in it.
+        name: path of the file in the folder.
         limit: largest size [bytes].
-        missing: message of the error if the file does not exist; None: a FileNotFoundError.
+        missing: message of the CheckpointError if the file does not exist; None: raise FileNotFoundError.
 
     Raises:
         CheckpointError: if the file cannot be read, or is not a JSON object.
-        FileNotFoundError: if the file does not exist.
+        FileNotFoundError: if the file does not exist and `missing` is None.
     """
     file = folder / name
     with read_errors(file):
@@ -229,10 +233,10 @@ def require_plain_entries(folder: Path, *, only_links: bool = False) -> None:
 
     Args:
         folder: the folder.
-        only_links: refuse only links, for a caller that reads files without blocking.
+        only_links: refuse only links, and accept pipes and devices, for callers whose reading does not block.
 
     Raises:
-        CheckpointError: with the first other entry.
+        CheckpointError: for the first entry that is a link, a pipe or a device.
     """
     try:
         entries = sorted(os.scandir(folder), key=lambda entry: entry.name)
@@ -243,7 +247,7 @@ def require_plain_entries(folder: Path, *, only_links: bool = False) -> None:
     if links:
         raise CheckpointError(f"{folder / links[0]} is a link; replace it by the file itself")
     if special and not only_links:
-        raise CheckpointError(f"{folder / special[0]} is not a regular file; move it out of the run")
+        raise CheckpointError(f"{folder / special[0]} is not a regular file; move it out of the run's folder")
 
 
 class _StrictError(ValueError):

@@ -1,4 +1,4 @@
-"""Studies: folders with several runs, of one configuration with several seeds or of the trials of a sweep.
+"""Create and read studies: folders with several runs, of one configuration with several seeds or of a sweep's trials.
 
 The entry `kind` of study.json is `seeds` or `sweep`. This module imports neither torch nor MuJoCo.
 """
@@ -22,7 +22,7 @@ _PART = re.compile(r"([0-9]{1,19})(?:\.\.([0-9]{1,19}))?")
 
 
 def read_seeds(text: str) -> list[int]:
-    """Parse seeds: a range `0..4` (both ends included), a list `1,5,9`, or a list of ranges.
+    """Parse the option `--seeds`: a range `0..4` (both ends included), a list `1,5,9`, or a list of ranges.
 
     Raises:
         UsageError: for other text, an empty range, a repeated seed, or too many seeds.
@@ -31,10 +31,11 @@ def read_seeds(text: str) -> list[int]:
     for part in text.split(","):
         found = _PART.fullmatch(part.strip())
         if found is None:
-            raise UsageError(f"--seeds '{text}': '{part.strip()}' is not a seed", hint="as in --seeds 0..4 or 1,5,9")
+            message = f"--seeds '{text}': '{part.strip()}' is neither a seed nor a range"
+            raise UsageError(message, hint="write a range or a list, such as --seeds 0..4 or --seeds 1,5,9")
         first, last = int(found[1]), int(found[2] or found[1])
         if last < first:
-            raise UsageError(f"--seeds '{text}': {part.strip()} is empty", hint=f"write {last}..{first}")
+            raise UsageError(f"--seeds '{text}': the range {part.strip()} is empty", hint=f"write {last}..{first}")
         if last > MAX_SEED or last - first >= _MAX_SEEDS or len(seeds) > _MAX_SEEDS:
             raise UsageError(f"--seeds '{text}': give at most {_MAX_SEEDS} seeds, each up to {MAX_SEED}")
         seeds += range(first, last + 1)
@@ -47,7 +48,9 @@ def read_seeds(text: str) -> list[int]:
 def create_study(
     runs_dir: Path, task: str, name: str | None, config: str, record: Mapping[str, Any], seeds: Sequence[int]
 ) -> Path:
-    """Create the folder of a study of several seeds, with a run for each seed; the runs are not started yet.
+    """Create the folder of a study of several seeds, with a run for each seed, and return the folder.
+
+    The runs are not started yet: their state is `waiting`.
 
     Args:
         runs_dir: the folder of runs.
@@ -85,8 +88,8 @@ def read_study(folder: Path, kind: str = "seeds") -> dict[str, Any]:
     """Read and check study.json of a study. `kind` is `seeds` (runs of several seeds) or `sweep`.
 
     Raises:
-        CheckpointError: if the folder is not a study of this kind, or its record is malformed, or the
-            folder or one of its runs has links or pipes.
+        CheckpointError: if the folder is not a study of this kind, if study.json is malformed, or if the folder or one
+            of its runs has links, pipes or devices.
     """
     require_plain_study(folder)
     record = read_json(
@@ -102,7 +105,7 @@ def require_plain_study(folder: Path) -> None:
     """Check that a study and its runs contain only regular files and folders; a folder that does not exist is valid.
 
     Raises:
-        CheckpointError: with the first other entry.
+        CheckpointError: for the first entry that is a link, a pipe or a device.
     """
     if folder.is_dir():
         require_plain_entries(folder)
@@ -111,10 +114,10 @@ def require_plain_study(folder: Path) -> None:
 
 
 def runs_of(folder: Path, record: Mapping[str, Any]) -> list[Path]:
-    """Return the folders of a study's runs. `record` is the content of study.json.
+    """Return the folders of the runs of a study of several seeds. `record` is the content of study.json.
 
     Raises:
-        CheckpointError: if the record names a run that is not `seed-N`.
+        CheckpointError: if the record has no runs, or a run whose name is not `seed-N`.
     """
     names = check_json(_StudyRuns, record, folder / STUDY).runs
     return [folder / name for name in names]

@@ -1,4 +1,4 @@
-"""Conversion of tensors to the bytes of a safetensors file, with a check that there is enough memory."""
+"""Convert tensors to the bytes of a safetensors file, after a check that there is enough memory."""
 
 from collections.abc import Mapping
 
@@ -11,7 +11,7 @@ _COPIES = 3
 
 
 def tensor_bytes(tensors: Mapping[str, Tensor], metadata: dict[str, str] | None = None) -> bytes:
-    """Return contiguous tensors in the format of safetensors.
+    """Return the bytes of a safetensors file with contiguous tensors, by name, and texts (`metadata`) in its header.
 
     Raises:
         MemoryError: if memory is too small. safetensors itself would abort the process.

@@ -1,8 +1,8 @@
-"""Protection against untrusted code: the task that a run or a recording names is imported only if the user trusts it.
+"""Remember which tasks the user trusts, so that a downloaded run or recording cannot name code that is then run.
 
-Installed tasks are always trusted. A run may also name a task folder or a configuration in Python; its author chose
-them, so they are untrusted. They are loaded only after the user has named them on a command line of this machine. The
-user's state folder has one file for each such task.
+Installed tasks are always trusted. A run may also name a task folder or a configuration in Python. The author of the
+run chose that code, so it is loaded only after the user has named it on a command line of this machine. The user's
+state folder has one file for each such task.
 """
 
 import contextlib
@@ -46,12 +46,15 @@ def is_known(record: Mapping[str, Any]) -> bool:
 
 
 def named_code(record: Mapping[str, Any]) -> str:
-    """Return the task's folder or `FILE.py:NAME` from a task's record, as one writes it on a command line."""
+    """Return the folder, or `FILE.py:NAME`, from a task's record, as the user writes it on a command line."""
     return str(record.get("python") or record["folder"])
 
 
 def _key(record: Mapping[str, Any]) -> str:
-    """Return the text that identifies the code of a task's record: the real path of its folder, or `FILE:ATTRIBUTE`."""
+    """Return the text that identifies the code of a task: the real path of its folder, or `FILE:ATTRIBUTE`.
+
+    `record` is the task's record (`TaskSource.record`).
+    """
     if not record.get("python"):
         return str(Path(str(record["folder"])).resolve())
     # the path is resolved in the same way as when the task is loaded
@@ -69,7 +72,7 @@ def _record_use(key: str) -> None:
 
 
 def _file(key: str) -> Path:
-    """Return the file that exists if the user has named the task before; `key`, from `_key`, identifies its code."""
+    """Return the file in the user's state folder that exists if the user has named the task; for `key` see `_key`."""
     import platformdirs
 
     folder = os.environ.get("RLCLI_STATE_DIR") or platformdirs.user_state_dir("rlcli")

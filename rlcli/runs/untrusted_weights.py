@@ -1,6 +1,6 @@
-"""Safe reading of model files that torch and Stable-Baselines3 have written.
+"""Read model files of torch (.pt) and Stable-Baselines3 (.zip) safely, for `rlcli import`.
 
-Only tensors and plain data are unpickled. `rlcli import` reads policies with it.
+The files may be untrusted: only tensors and plain data are unpickled.
 """
 
 import io
@@ -31,7 +31,7 @@ VEC_NORMALIZE_HINT = (
 
 
 def read_archive_file(file: Path) -> bytes:
-    """Read a whole file.
+    """Return the content of a file; links are followed.
 
     Raises:
         CheckpointError: if there is no such file, or the file is larger than 4 GiB or a quarter of the memory.
@@ -67,9 +67,11 @@ def _archive(data: bytes, where: str) -> zipfile.ZipFile:
         archive = zipfile.ZipFile(io.BytesIO(data))
         members = archive.infolist()
     except Exception as error:  # zipfile raises many types of errors for malformed numbers
-        raise CheckpointError(f"{where} is not a valid zip file: {one_line(error)}; save it again") from None
+        raise CheckpointError(f"{where} is not a valid zip file: {one_line(error)}; save the file again") from None
     if len(members) > _MAX_MEMBERS:
-        raise CheckpointError(f"{where} has {len(members)} members; at most {_MAX_MEMBERS} are allowed; save it again")
+        raise CheckpointError(
+            f"{where} has {len(members)} members; at most {_MAX_MEMBERS} are allowed; save the file again"
+        )
     seen: set[str] = set()
     for member in members:
         name = member.filename
@@ -86,7 +88,8 @@ def _archive(data: bytes, where: str) -> zipfile.ZipFile:
         }
         for reason, applies in refused.items():
             if applies:
-                raise CheckpointError(f"{where} has a member {name[:60]!r} that is refused: {reason}; save it again")
+                message = f"{where} has a member {name[:60]!r} that is refused: {reason}; save the file again"
+                raise CheckpointError(message)
         seen.add(name.casefold())
     total, limit = sum(member.file_size for member in members), min(_MAX_BYTES, available_memory() // 4)
     if total > limit:
@@ -130,7 +133,7 @@ def read_tensors(data: bytes, where: str) -> Mapping[str, Any]:
     described = [name for name in archive.namelist() if name.rpartition("/")[2] == "data.pkl"]
     if len(described) != 1 or archive.getinfo(described[0]).file_size > pickle_check.MAX_BYTES:
         raise CheckpointError(
-            f"{where} is not a torch file: its data.pkl is missing or too large; save it again with torch.save"
+            f"{where} is not a torch file: its data.pkl is missing or too large; save the file again with torch.save"
         )
     pickle_check.require_tensors_only(_content(archive, described[0], where), where)
     try:

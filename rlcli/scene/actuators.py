@@ -1,6 +1,6 @@
-"""Actuator models: PD controllers and DC motors outside of MuJoCo, computed before each physics step.
+"""Actuator models: PD controllers and DC motors that rlcli, not MuJoCo, computes before each physics step.
 
-MuJoCo's own actuators do not use this module: the engine computes them in its call for a whole environment step.
+Class `JointCommand` writes the commands of action terms, to actuator models or to MuJoCo's own actuators.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ POSITION, VELOCITY, EFFORT = range(3)
 Controller = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
 """Controller: a function (targets, joint positions, joint velocities) -> (efforts before limits, efforts after limits).
 
-Targets are (num_envs, 3, k), all others (num_envs, k).
+Targets are (num_envs, 3, k), all others (num_envs, k), where k is the number of joints.
 """
 _ROW = {"position": POSITION, "velocity": VELOCITY, "motor": EFFORT}
 
@@ -34,7 +34,8 @@ class ActuatorModel(TensorState):
 
     effort = stiffness x (position target - position) + damping x (velocity target - velocity) + effort target. The
     effort is clamped to the effort limit. The effort of a DC motor is also clamped to its torque-speed curve,
-    saturation effort x (+-1 - velocity / velocity limit): the line from the stall torque to the no-load speed.
+    saturation effort x (+-1 - velocity / velocity limit): the line from the stall torque to the no-load speed. In
+    shapes, k is the number of the model's joints.
     """
 
     def __init__(self, name: str, config: ActuatorConfig, entity: Entity) -> None:
@@ -44,7 +45,7 @@ class ActuatorModel(TensorState):
         engine = entity.engine
         n, device = engine.num_envs, engine.device
         self.joints = match(config.joints, entity.joint_names, "joint")
-        """Joint columns, in the order of the configuration."""
+        """Indices of the joints among the entity's joints, in the order of the configuration."""
         self.columns = as_index(self.joints, device)
         """Index that selects the driven joints in tensors with one column for each joint of the entity."""
         names = [entity.joint_names[j] for j in self.joints]
@@ -71,9 +72,9 @@ class ActuatorModel(TensorState):
         self.targets = torch.zeros(n, 3, k, device=device)
         """Position, velocity and effort targets of each joint. (num_envs, 3, k)"""
         self.computed_effort = torch.zeros(n, k, device=device)
-        """Efforts of the controller in the last substep, before limits. (num_envs, k) [N or N m]"""
+        """Efforts of the controller in the last physics step, before limits. (num_envs, k) [N or N m]"""
         self.applied_effort = torch.zeros(n, k, device=device)
-        """Efforts on the joints in the last substep, after limits. (num_envs, k) [N or N m]"""
+        """Efforts on the joints in the last physics step, after limits. (num_envs, k) [N or N m]"""
         default = entity.data.default_joint_pos[:, self.joints]
         self._default_targets = torch.stack([default, torch.zeros_like(default), torch.zeros_like(default)], dim=1)
         self._stream = stream(f"scene.entities.{entity.name}.actuators.{name}")
@@ -138,7 +139,7 @@ class ActuatorModel(TensorState):
         return history.gather(1, index)[:, 0]
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return the tensors that are saved in a checkpoint."""
+        """Return the tensors that are saved in a checkpoint, by name."""
         own = {
             "targets": self.targets,
             "stiffness": self.stiffness,
@@ -194,7 +195,10 @@ class JointCommand:
                 self._model_targets.append((actuator.targets[:, _ROW[kind]], from_columns, to_joints))
 
     def write(self, command: Tensor) -> None:
-        """Set the commands of the joints, which hold until the next call. command (num_envs, columns)"""
+        """Set the commands of the joints, which hold until the next call. command (num_envs, columns)
+
+        Commands are efforts [N or N m], positions [m or rad] or velocities [m/s or rad/s], by the constructor's `kind`.
+        """
         if self._has_native:
             own = command if self._all_native else command[:, self._sources]
             own = own if self._factor is None else own * self._factor

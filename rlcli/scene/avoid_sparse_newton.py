@@ -1,7 +1,7 @@
-"""Guard against a bug of MuJoCo 4.0.0: its sparse Newton solver computes wrong accelerations for some models.
+"""Avoid a bug of MuJoCo 4.0.0, whose sparse Newton solver computes wrong accelerations for some models.
 
 The factorization of a sparse Hessian merges rows that must stay apart. This happens only if a constraint couples
-joints of two branches: a contact of two moving bodies, an equality or a tendon. MuJoCo 4.0.1 corrects it.
+joints of two branches: a contact of two moving bodies, an equality or a tendon. MuJoCo 4.0.1 corrects the bug.
 """
 
 from __future__ import annotations
@@ -21,7 +21,12 @@ _AUTO_SPARSE = 60
 
 
 def avoid_sparse_newton(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
-    """Choose the dense solver for a model that the bug can affect; warn if its MJCF demands the sparse one."""
+    """Choose MuJoCo's dense solver for a model that the bug can affect; log a warning if its MJCF sets the sparse one.
+
+    Args:
+        spec: the specification of the model, whose option is set, too.
+        model: the compiled model.
+    """
     option = model.opt
     sparse = option.jacobian == mujoco.mjtJacobian.mjJAC_SPARSE
     automatic = option.jacobian == mujoco.mjtJacobian.mjJAC_AUTO and model.nv >= _AUTO_SPARSE

@@ -40,7 +40,7 @@ _JOIN_TIMEOUT = 5.0
 
 
 class CameraSensor(LazySensor):
-    """Camera that renders one image of every environment when it is read, at most once per step.
+    """Camera that renders one image of every environment when a term reads `image`, at most once per step.
 
     Args:
         name: name of the sensor.
@@ -63,11 +63,11 @@ class CameraSensor(LazySensor):
 
     @property
     def image(self) -> Tensor:
-        """Images, the top row first. rgb: (num_envs, h, w, 3) uint8; else (num_envs, h, w, 1) float32 [m] or ids.
+        """Images, the top row first: rgb (num_envs, h, w, 3) uint8, other data (num_envs, h, w, 1) float32.
 
-        Segmentation has the ids of the visible bodies, 0 for the world's own geoms, and -1 where nothing is visible.
-        A distance of 0 m means that nothing is within `clip`. Where a pixel is the mean of several samples, samples
-        without a hit count as 0 m.
+        Depth and distance are in meters; 0 means that nothing is within `clip`. Segmentation has the ids of the visible
+        bodies, 0 for the world's own geoms, and -1 where nothing is visible. Where a pixel is the mean of several
+        samples, samples without a hit count as 0 m.
         """
         if not self._current:
             self._current = True
@@ -75,7 +75,7 @@ class CameraSensor(LazySensor):
         return self._image
 
     def on_moved(self, selection: Selection) -> None:
-        """Render again the environments whose bodies were moved, if the image has been read in this step."""
+        """Render again the selected environments, whose bodies were moved, if `image` has been read in this step."""
         if self._current:
             self._render(ids_of(selection))
 
@@ -97,7 +97,7 @@ class CameraSensor(LazySensor):
 
 
 class CameraRenderer:
-    """Renderer of camera images with an OpenGL context, which one thread must make, use and free.
+    """Renderer of camera images, with an OpenGL context that a single thread must create, use and free.
 
     Args:
         model: model of the scene.
@@ -126,7 +126,10 @@ class CameraRenderer:
         self._option = mujoco.MjvOption()
 
     def load_state(self, engine: ReplayableEngine, env: int) -> None:
-        """Copy an environment's state and own model values (such as colours) into the renderer, before `render`."""
+        """Copy the state of environment `env`, and its own model values (such as colours), into the renderer.
+
+        Call it before `render`.
+        """
         if engine.expanded_fields():
             if self._model is self._shared_model:
                 self._model = copy.copy(self._shared_model)
@@ -228,14 +231,14 @@ class RendererPool:
         return len(self._threads)
 
     def run(self, work: Sequence[Callable[[CameraRenderer], None]]) -> None:
-        """Call each function in a thread of its own, with this thread's renderer as argument; wait for all of them.
+        """Call each function in a thread of its own, with that thread's renderer as argument; wait for all of them.
 
         Raises:
-            MachineError: after `close`, or in a fork of the process that opened the contexts.
+            MachineError: after `close`, or in a fork of the process that created the pool.
         """
         if os.getpid() != self._process:
-            message = "cameras render only in the process that made the environment; this process is a fork of it"
-            hint = "make the environment in the new process, or start the process with 'spawn'"
+            message = "cameras render only in the process that created the environment; this process is a fork of it"
+            hint = "create the environment in this process, or start the process with multiprocessing's method 'spawn'"
             raise MachineError(message, hint=hint)
         if not self._end.alive:
             raise MachineError("the environment is closed, so its cameras cannot render; create a new environment")
@@ -247,7 +250,7 @@ class RendererPool:
             future.result()
 
     def close(self) -> None:
-        """End the threads, each of which frees its context."""
+        """End the threads, each of which frees its OpenGL context."""
         self._end()
         if os.getpid() == self._process:
             for thread in self._threads:
@@ -255,7 +258,7 @@ class RendererPool:
 
 
 def make_cameras(specs: Mapping[str, CameraSensorSpec], engine: Engine) -> dict[str, CameraSensor]:
-    """Make the camera sensors of a compiled scene.
+    """Return the camera sensors of a compiled scene, by name.
 
     Raises:
         ConfigError: for an engine whose states are not on the CPU.
@@ -264,7 +267,7 @@ def make_cameras(specs: Mapping[str, CameraSensorSpec], engine: Engine) -> dict[
     if not specs:
         return {}
     if (states := engine.replayable) is None:
-        hint = "use --device cpu, and leave out sim.engine: warp"
+        hint = "use --device cpu, and remove sim.engine: warp if the task sets it"
         message = "cameras need the CPU engine; the GPU engine cannot render them"
         raise ConfigError([Problem("scene", f"scene.sensors.{name}", message, hint) for name in specs])
     configs = [spec.config for spec in specs.values()]
@@ -278,9 +281,9 @@ _Orders = queue.SimpleQueue[tuple[Callable[[CameraRenderer], None], Future[None]
 
 
 def _render_orders(model: mujoco.MjModel, width: int, height: int, orders: _Orders, ready: Future[None]) -> None:
-    """Open an OpenGL context and call the functions in the queue `orders` with it: the function of a rendering thread.
+    """Create a renderer, and call each function in the queue `orders` with it; a rendering thread runs this function.
 
-    OpenGL requires that one thread makes, uses and frees a context. `ready` gets the error if no context opens.
+    OpenGL requires that a single thread creates, uses and frees a context. `ready` gets the error if no OpenGL works.
     """
     try:
         renderer = CameraRenderer(model, width, height)
@@ -336,7 +339,7 @@ def _depths(nearness: NDArray[np.float32], view: mujoco.MjvGLCamera, *, along_ra
 
 
 def _ray_lengths(height: int, width: int, view: mujoco.MjvGLCamera) -> NDArray[np.float32]:
-    """Return the length of the ray through each pixel up to a depth of 1, the bottom row first. (h, w)"""
+    """Return the length of the ray through each pixel up to a depth of 1 m, the bottom row first. (h, w) [m]"""
     rows, columns = ((np.arange(count) + 0.5) / count for count in (height, width))
     half = view.frustum_width or 0.5 * (view.frustum_top - view.frustum_bottom) * width / height
     y = (view.frustum_bottom + rows * (view.frustum_top - view.frustum_bottom)) / view.frustum_near

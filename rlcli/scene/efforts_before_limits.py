@@ -1,6 +1,6 @@
-"""Computation of the efforts that actuators would have on an entity's joints without limits.
+"""Compute the efforts that actuators would have on an entity's joints without limits, and the limits.
 
-Terms that penalise saturated actuators use them.
+Terms that penalise saturated actuators use these efforts.
 """
 
 from __future__ import annotations

@@ -39,7 +39,7 @@ KINDS = {
     "Tendons": (mujoco.mjtObj.mjOBJ_TENDON, "ntendon"),
     "Pairs": (mujoco.mjtObj.mjOBJ_PAIR, "npair"),
 }
-"""Kind of element, such as Joints -> (its type in MuJoCo, name of the MjModel field with the number of them)."""
+"""Kind of element, such as Joints -> (its type in MuJoCo, name of the MjModel field with the number of elements)."""
 _SCALAR = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 
 
@@ -62,7 +62,7 @@ class Entity:
         self.joint_ids, self.body_ids, self.site_ids = self.ids["Joints"], self.ids["Bodies"], self.ids["Sites"]
         self.actuator_ids, self.geom_ids = self.ids["Actuators"], self.ids["Geoms"]
         self.names = {alias: _names(model, name, kind, self.ids[alias]) for alias, (kind, _) in KINDS.items()}
-        """Names of the entity's elements, without its prefix, by kind."""
+        """Names of the entity's elements, without the prefix `ENTITY/`, by kind."""
         self.joint_names = self.names["Joints"]
         self.qpos_columns = id_tensor(model.jnt_qposadr[self.joint_ids], engine.device)
         self.dof_columns = id_tensor(model.jnt_dofadr[self.joint_ids], engine.device)
@@ -85,7 +85,8 @@ class Entity:
     def select(self, alias: str, patterns: str | Sequence[str]) -> tuple[Columns, list[str]]:
         """Find elements (joints, bodies, ...) of this entity by their names.
 
-        Return an index that selects the elements in the entity's tensors, such as `data.joint_pos`, and their names.
+        Return an index that selects the elements in the entity's tensors, such as `data.joint_pos`, and the names of
+        the elements.
 
         Args:
             alias: the kind of element, as a type alias of `rlcli.task`: Joints, Bodies, ...
@@ -103,9 +104,10 @@ class Entity:
         return self._index(positions), [names[p] for p in positions]
 
     def actuators_of(self, kind: str) -> list[tuple[int, int]]:
-        """Return, for MuJoCo's actuators of one kind, (index of the driven joint in the entity, id of the actuator).
+        """Return (index of the driven joint in the entity, id of the actuator) for MuJoCo's actuators of one kind.
 
-        `kind` is motor, position, velocity or other. Actuator models (`scene.entities.*.actuators`) are left out.
+        `kind` is motor, position, velocity or other. The motors through which actuator models
+        (`scene.entities.*.actuators`) act are included as motors.
         """
         model = self.engine.model
         columns = {joint: column for column, joint in enumerate(self.joint_ids.tolist())}
@@ -197,7 +199,7 @@ class Entity:
         return as_index(positions, self.engine.device)
 
     def _target(self, field: Tensor, field_columns: Tensor, joints: Columns) -> tuple[Field, Columns]:
-        """Return (tensor, columns) to which values of some joints are written.
+        """Return (tensor, columns of the tensor) to which the values of some joints are written.
 
         Args:
             field: qpos or qvel of all environments.
@@ -205,8 +207,8 @@ class Entity:
             joints: which joints, as an index into the entity's joints.
 
         Returns:
-            For consecutive columns a view of only these columns, with the index of all its columns; otherwise `field`
-            with the joints' columns.
+            For joints in consecutive columns: a view of these columns, and the index of all columns of the view. For
+            other joints: `field`, and the joints' columns.
         """
         index = (joints.start, joints.stop, joints.step) if isinstance(joints, slice) else (id(joints),)
         key = (id(field_columns), *index)

@@ -21,9 +21,10 @@ if TYPE_CHECKING:
 
 
 class EntityData:
-    """State of an entity in every environment, in float32. The world frame belongs to the environment's own simulation.
+    """State of an entity in every environment, in float32; k is the number of its joints.
 
-    Do not write to the attributes: most are live views of the state. Set the state with the methods of `Entity`.
+    Each environment has a world frame of its own. Do not write to the attributes: most are views of the state, which is
+    set with the methods of `Entity`.
     """
 
     def __init__(self, entity: Entity, sim: SimData) -> None:
@@ -117,10 +118,7 @@ class EntityData:
         return self._default_vel.of(self.default_joint_vel, joints)
 
     def read_default_joints(self, selection: Selection, joints: Columns = ALL) -> tuple[Tensor, Tensor]:
-        """Return the default positions and velocities of some joints for the selected environments. (rows, k) each
-
-        Do not write to the tensors: they may be views.
-        """
+        """Return the default positions and velocities of some joints in the selected environments. (rows, k) each"""
         position, velocity = self.default_joint_pos, self.default_joint_vel
         if not isinstance(joints, slice):
             return selection.read_view(position, joints), selection.read_view(velocity, joints)
@@ -151,7 +149,7 @@ class EntityData:
 
     @property
     def joint_acc(self) -> Tensor:
-        """Joint accelerations over the last substep. (num_envs, k) [m/s^2 or rad/s^2]"""
+        """Joint accelerations over the last physics step. (num_envs, k) [m/s^2 or rad/s^2]"""
         return self._sim.derived_field("qacc")[:, self._dof_index]
 
     @property
@@ -238,8 +236,8 @@ class EntityData:
     def computed_effort(self) -> Tensor:
         """Efforts that actuators would have on the joints if no force limit applied. (num_envs, k) [N or N m]
 
-        Actuator models: efforts of the last substep. Motor, position and velocity actuators of MuJoCo (fixed gain, no
-        bias or an affine one, no dynamics): computed from the present state and controls. Other actuators count as 0.
+        Actuator models: efforts of the last physics step. Motor, position and velocity actuators of MuJoCo (fixed gain,
+        no bias or an affine one, no dynamics): efforts in the present state with the present controls. Others: 0.
         """
         return self._once("computed_effort", self._efforts.without_limits)
 
@@ -293,13 +291,13 @@ class EntityData:
 
     @property
     def body_lin_vel_w(self) -> Tensor:
-        """Velocities of the bodies' origins or centres of mass (`velocity_point`). (num_envs, bodies, 3) [m/s]"""
+        """Velocities of the bodies' `velocity_point` (origin or centre of mass), world frame. (num_envs, bodies, 3)"""
         return self._once("body_lin_vel_w", lambda: self.body_lin_vel_of(ALL))
 
     def body_lin_vel_of(self, bodies: Columns, point: str | None = None) -> Tensor:
-        """Return `body_lin_vel_w[:, bodies]`, computed for these bodies only. (num_envs, k, 3) [m/s]
+        """Return `body_lin_vel_w[:, bodies]`, computed for these bodies only. (num_envs, bodies, 3) [m/s]
 
-        point: `origin` or `com`; None: the entity's `velocity_point`.
+        point: `origin` or `com` (centre of mass); None: the entity's `velocity_point`.
         """
         columns, roots = self._columns_of(bodies)
         at_com = self._at_com if point is None else point == "com"
@@ -319,7 +317,7 @@ class EntityData:
 
     @property
     def body_lin_vel_b(self) -> Tensor:
-        """`body_lin_vel_w`, each in its body's frame. (num_envs, bodies, 3) [m/s]"""
+        """Linear velocities of the bodies (`body_lin_vel_w`), each in its body's frame. (num_envs, bodies, 3) [m/s]"""
         return self._once("body_lin_vel_b", lambda: rotate_inverse(self.body_quat_w, self.body_lin_vel_w))
 
     @property
@@ -329,12 +327,12 @@ class EntityData:
 
     @property
     def body_ang_acc_w(self) -> Tensor:
-        """Angular accelerations over the last substep, world frame. (num_envs, bodies, 3) [rad/s^2]"""
+        """Angular accelerations over the last physics step, world frame. (num_envs, bodies, 3) [rad/s^2]"""
         return self._body_force("cacc")[:, self._body_index, :3]
 
     @property
     def body_lin_acc_w(self) -> Tensor:
-        """Accelerations of each body's `velocity_point` over the last substep, world frame.
+        """Accelerations of each body's `velocity_point` over the last physics step, world frame.
 
         (num_envs, bodies, 3) [m/s^2]. The acceleration is 0 at rest and equals gravity in free fall.
         """
@@ -352,9 +350,9 @@ class EntityData:
 
     @property
     def body_incoming_wrench_b(self) -> Tensor:
-        """Force and torque of each body's parent on the body, body frame. (num_envs, bodies, 6) [N, N m]
+        """Force and torque that each body's parent exerts on the body, body frame. (num_envs, bodies, 6) [N, N m]
 
-        Values of the last substep; the torque is about the origin of the body's frame.
+        Values of the last physics step; the torque is about the origin of the body's frame.
         """
 
         def compute() -> Tensor:
@@ -386,7 +384,7 @@ class EntityData:
 
     @property
     def site_lin_vel_w(self) -> Tensor:
-        """Velocities of the sites, world frame. (num_envs, sites, 3) [m/s]"""
+        """Linear velocities of the sites, world frame. (num_envs, sites, 3) [m/s]"""
         bodies, roots = self._site_body, self._tree_root_of_sites
         return self._once("site_lin_vel_w", lambda: self._velocity_at(self.site_pos_w, bodies, roots))
 
@@ -396,12 +394,12 @@ class EntityData:
         return self._sim.derived_field("sensordata")
 
     def _soft_limits(self, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the limits, narrowed about their middle by `soft_joint_pos_limit_factor`."""
+        """Return lower and upper limits, narrowed about their middle by `soft_joint_pos_limit_factor`. (..., k) each"""
         middle, half = 0.5 * (low + high), 0.5 * self._entity.config.soft_joint_pos_limit_factor * (high - low)
         return middle - half, middle + half
 
     def _columns_of(self, bodies: Columns) -> tuple[Columns, Columns]:
-        """Return the model ids of some bodies, and of the root bodies of their kinematic trees; cached."""
+        """Return the model ids of some bodies of the entity, and of the roots of their kinematic trees; cached."""
         found = self._body_columns.get(id(bodies))
         if found is None:
             model, device = self._entity.engine.model, self._entity.engine.device
@@ -413,13 +411,16 @@ class EntityData:
         return found[1:]
 
     def _velocity_at(self, points: Tensor, bodies: Columns, roots: Columns) -> Tensor:
-        """Return the velocities of points (world frame) of bodies in trees with these roots. (num_envs, bodies, 3)"""
+        """Return the linear velocities of points (num_envs, n, 3) of n bodies, world frame. (num_envs, n, 3) [m/s]
+
+        `bodies` are the ids of the bodies, `roots` those of the root bodies of their kinematic trees.
+        """
         # MuJoCo's cvel is the velocity at the centre of mass of the body's kinematic tree
         velocity = self._sim.derived_columns("cvel", bodies)
         return velocity[..., 3:] + cross(velocity[..., :3], self._from_tree_com(points, roots))
 
     def _from_tree_com(self, points: Tensor, roots: Columns) -> Tensor:
-        """Return the vectors from the centres of mass of kinematic trees, whose root bodies are `roots`, to points."""
+        """Return the vectors from the centres of mass of kinematic trees (ids of their roots: `roots`) to points."""
         return points - self._sim.derived_columns("subtree_com", roots)
 
     def _body_force(self, name: str) -> Tensor:

@@ -1,7 +1,8 @@
 """Mirror image of an entity about the x-z plane of its root, derived from the geometry of the compiled model.
 
-With S = diag(1, -1, 1), the mirror image of a position or another vector v is S v, that of an angular velocity or
-another pseudovector w is -S w, and that of the quaternion (w, x, y, z) is (w, -x, y, -z).
+PPO uses it for agents with `symmetry`. With S = diag(1, -1, 1), the mirror image of a position or another vector v is
+S v, that of an angular velocity or another pseudovector w is -S w, and that of the quaternion (w, x, y, z) is
+(w, -x, y, -z).
 """
 
 from __future__ import annotations
@@ -19,14 +20,17 @@ Points = NDArray[np.float64]
 VECTOR, PSEUDOVECTOR, QUATERNION = (1, -1, 1), (-1, 1, -1), (1, -1, 1, -1)
 """Signs by which the components of a quantity are multiplied to reflect the quantity about the x-z plane."""
 _TOLERANCE = 1e-3
-"""Largest distance between an element and the mirror image of its partner [m]; also the limit for unit axis vectors."""
+"""Largest distance between an element and the mirror image of its partner [m].
+
+The components of unit vectors along joint axes may differ by the same number.
+"""
 
 
 class EntityMirror:
-    """Mirror image of an entity: the partner of each joint. A joint on the mirror plane is its own partner.
+    """Mirror image of an entity, which assigns a partner to each joint. A joint on the mirror plane is its own partner.
 
     Raises:
-        TaskError: for a joint or a body without a partner.
+        TaskError: if a body has no mirror image, or a joint differs from the mirror image of its partner.
     """
 
     def __init__(self, entity: Entity) -> None:
@@ -36,13 +40,16 @@ class EntityMirror:
         self._axes = self._data.xmat[self._root].reshape(3, 3)
         self._bodies: dict[int, int] = {}
         self.joints: dict[int, tuple[int, int]] = {}
-        """Joint -> its partner, and the sign with which the partner's coordinate follows from the joint's."""
+        """Id of a joint -> (id of its partner, sign that converts the joint's coordinate to the partner's)."""
         for body in range(self._root, self._model.nbody):  # a parent comes before its children
             if body == self._root or int(self._model.body_parentid[body]) in self._bodies:
                 self._pair(body)
 
     def reflect(self, qpos: Tensor, qvel: Tensor, to_qpos: Tensor, to_qvel: Tensor) -> None:
-        """Write the mirror image of this entity's part of a state to `to_qpos` and `to_qvel`. (n, nq) and (n, nv)"""
+        """Write the mirror image of this entity's columns of `qpos` and `qvel` to `to_qpos` and `to_qvel`.
+
+        The tensors are (n, nq) and (n, nv), one state of the whole model in each row.
+        """
         model = self._model
         for joint, (partner, sign) in self.joints.items():
             q, v, to_q, to_v = (
@@ -79,7 +86,7 @@ class EntityMirror:
     def _sign(self, body: int, joint: int, other: int) -> int:
         """Return the sign by which the coordinate of `joint` is multiplied to get that of its partner `other`.
 
-        It is +1 for the free joint of the root.
+        The sign of the root's free joint is +1.
         """
         model, data, kind = self._model, self._data, self._model.jnt_type[joint]
         if kind == mujoco.mjtJoint.mjJNT_FREE:
@@ -92,7 +99,7 @@ class EntityMirror:
         if not same or np.abs(sign * axis - image).max() > _TOLERANCE:
             raise self._error(body, f"has another type or axis than the mirror image of '{model.joint(other).name}'")
         if turns and self._distance(data.xanchor[other], data.xanchor[joint]) > _TOLERANCE:
-            raise self._error(body, f"is not where the mirror image of '{model.joint(other).name}' is")
+            raise self._error(body, f"is not at the position of the mirror image of '{model.joint(other).name}'")
         return sign
 
     def _error(self, body: int, reason: str) -> TaskError:

@@ -1,6 +1,6 @@
-"""Model (MjSpec) of one robot or object before it is attached to the scene.
+"""Create the model (MjSpec) of one robot or object, before it is attached to the scene.
 
-It comes from an MJCF file, which is checked before MuJoCo opens it, or is a single shape.
+The model comes from an MJCF file, which is checked before MuJoCo opens the file, or consists of a single shape.
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ def checked_models(
         installed: whether the task is installed: the files of an installed task are trusted.
 
     Returns:
-        (name of the entity -> checked model, problems). Shapes, and entities with a problem, have no model.
+        The checked models by the name of the entity, and the problems. Shapes, and entities with a problem, have no
+        model.
 
     Raises:
         MissingModelError: if the user has to provide a model.
@@ -89,9 +90,9 @@ def entity_spec(
 
 
 def frame_of_start_pose(child: mujoco.MjSpec, entity: EntityConfig) -> tuple[FloatArray, FloatArray]:
-    """Return the position and quaternion of the frame to which a model is attached.
+    """Return the position [m] and quaternion (w, x, y, z) of the frame in the scene to which a model is attached.
 
-    The frame is chosen so that the root of the model has the start pose that the configuration gives.
+    In this frame, the root of the model has the start pose of the configuration (`pos`, `quat`).
     """
     pos, quat = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
     element: Any = child.worldbody.first_body()
@@ -106,9 +107,9 @@ def frame_of_start_pose(child: mujoco.MjSpec, entity: EntityConfig) -> tuple[Flo
 
 
 def write_masses(child: mujoco.MjSpec) -> None:
-    """Write the computed mass and inertia of every body into the model.
+    """Compile a model, and write the computed mass and inertia of every body into its MjSpec.
 
-    Otherwise the MJCF's setting `settotalmass` would be lost when the model is attached to a scene.
+    The MJCF's setting `settotalmass` would be lost when the model is attached to a scene.
     """
     with warnings.catch_warnings(action="ignore"):  # MuJoCo has deprecated the attribute, but models still use it
         model = child.compile()
@@ -133,7 +134,10 @@ def _orientation(element: Any) -> FloatArray:
 
 
 def _product(pos: FloatArray, quat: FloatArray, pos2: FloatArray, quat2: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the product of two poses: the pose in the world of pose 2, which is given in the frame of pose 1."""
+    """Return the product of two poses: pose 2, which is given in the frame of pose 1, in the frame of pose 1's parent.
+
+    Positions are (3,) [m], quaternions (4,) w, x, y, z.
+    """
     product = np.empty(3), np.empty(4)
     mujoco.mju_mulPose(*product, pos, quat, pos2, quat2)
     return product

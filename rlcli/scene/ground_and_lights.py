@@ -1,7 +1,4 @@
-"""Functions that add ground plane, ground material, sky and lights to the model of a scene.
-
-`rlcli.scene.scene` calls them.
-"""
+"""Add a ground plane, the ground's material, the sky and lights to the model of a scene."""
 
 from __future__ import annotations
 
@@ -11,7 +8,7 @@ from rlcli.config.schema import GroundConfig, LightsConfig
 
 
 def add_ground_plane(spec: mujoco.MjSpec, ground: GroundConfig) -> None:
-    """Add a ground plane to the model of a scene."""
+    """Add a ground plane, with its material and the sky, to the model of a scene."""
     add_materials(spec)
     spec.worldbody.add_geom(
         name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[ground.size / 2, ground.size / 2, 1.0],
@@ -34,7 +31,7 @@ def add_materials(spec: mujoco.MjSpec) -> None:
 
 
 def add_lights(spec: mujoco.MjSpec, lights: LightsConfig) -> None:
-    """Add ambient light (dome) and directional light (distant) to a model; an intensity of 1000 is full strength."""
+    """Add ambient light (`dome`) and directional light (`distant`) to a model; intensity 1000 is full strength."""
     headlight = spec.visual.headlight
     if lights.dome is not None:
         strength = min(1.0, lights.dome.intensity / 1000.0)

@@ -1,7 +1,4 @@
-"""Table of terrain heights, from which ray sensors read distances to the ground instead of casting rays.
-
-A ray sensor uses the table with `lookup: true`.
-"""
+"""Table of terrain heights, from which ray sensors with `lookup: true` read distances instead of casting rays."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Default state of an entity, to which resets return: positions and velocities of joints and root.
+"""Default state of an entity, to which resets return (positions and velocities of joints and root); speed limits.
 
-It comes from the MJCF and from the configuration (`init`, `pos`, `quat`).
+The values come from the MJCF and from the configuration (`init`, `pos`, `quat`, `velocity_limit`).
 """
 
 from __future__ import annotations
@@ -21,7 +21,9 @@ if TYPE_CHECKING:
 
 
 def default_joint_state(entity: Entity) -> tuple[Tensor, Tensor]:
-    """Return default joint positions and velocities: the MJCF's qpos0, overridden by the entity's `init`. (k,), (k,)
+    """Return the default positions [m or rad] and velocities [m/s or rad/s] of an entity's joints. (k,), (k,)
+
+    They are the MJCF's qpos0 and 0, overridden by the entity's `init`.
 
     Raises:
         NameProblem: if `init` names a joint that the model does not have.
@@ -36,7 +38,10 @@ def default_joint_state(entity: Entity) -> tuple[Tensor, Tensor]:
 
 
 def joint_speed_limits(entity: Entity) -> Tensor:
-    """Return the speed limit of each joint: `velocity_limit` of the joint, or else of its actuator model. (k,)"""
+    """Return the speed limit of each joint; infinite for a joint without a limit. (k,) [m/s or rad/s]
+
+    The limit is `velocity_limit` of the joint, or else that of its actuator model.
+    """
     names, config = entity.joint_names, entity.config
     limits = torch.full((len(names),), torch.inf)
     for motor in config.actuators.values():
@@ -61,12 +66,15 @@ def values_by_joint(value: float | Mapping[str, float], names: Sequence[str]) ->
         return torch.full((len(names),), float(value))
     values = match_values(value, names, "joint")
     if None in values:
-        raise NameProblem(f"no value for joint '{names[values.index(None)]}'; add one, or a pattern that matches it")
+        message = f"no value for joint '{names[values.index(None)]}'; add its name, or a pattern that matches the name"
+        raise NameProblem(message)
     return torch.tensor(values, dtype=torch.float32)
 
 
 def default_root_state(entity: Entity) -> Tensor:
-    """Return the default pose and velocity of the root: position, quaternion, linear and angular velocity. (13,)
+    """Return the default pose and velocity of the root, world frame. (13,)
+
+    The numbers are position [m], quaternion (w, x, y, z), linear velocity [m/s] and angular velocity [rad/s].
 
     Raises:
         NameProblem: if `init` has a velocity of the root, but the root has no free joint.

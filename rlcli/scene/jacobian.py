@@ -1,6 +1,6 @@
-"""Geometric Jacobian of a body with respect to the joints of its entity.
+"""Geometric Jacobian of a point of a body with respect to the joints of its entity.
 
-It is computed from the joints' axes and anchors in the world; action terms for inverse kinematics use it.
+Action terms for inverse kinematics use the Jacobian. It is computed from the axes and anchors of the joints.
 """
 
 from __future__ import annotations
@@ -70,8 +70,8 @@ class Jacobian:
 def sums_of_products(left: Tensor, right: Tensor) -> Tensor:
     """Return the sum over the first dimension of the outer products. (k, r, n), (k, c, n) -> (r, c, n)
 
-    For each environment, which is the last dimension, this is a matrix product. On a CPU it takes a third of the time
-    of `torch.bmm`, and rounds like it: the products are added to 0 in order.
+    For each environment, which is the last dimension, this is a matrix product. On a CPU this function takes a third of
+    the time of `torch.bmm`, and rounds in the same way: the products are added to 0 in order.
     """
     columns, rows = left[:, :, None].unbind(), right[:, None].unbind()
     total = (columns[0] * rows[0]).add_(0.0)

@@ -1,6 +1,7 @@
-"""Writer of joint settings and actuators into the model of a scene, before it is compiled.
+"""Write joint settings and actuators into the model of a scene, before the model is compiled.
 
-It applies the section `joints` of an entity, and adds actuators that terms need and the MJCF lacks.
+The settings are those of the section `joints` of an entity. Actuators are added if terms need them and the MJCF does
+not have them.
 """
 
 from __future__ import annotations
@@ -22,12 +23,16 @@ _KNOWN_ACTUATORS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtDyn.mjDYN_NONE
 
 @dataclass(frozen=True, slots=True)
 class ActuatorNeed:
-    """Actuators that an action term needs: their kind (motor, position, velocity), and the joints that they drive."""
+    """Actuators that an action term needs: their kind, and the joints that they drive."""
 
     entity: str
+    """Name of the entity."""
     joints: str | list[str]
+    """Names or regular expressions of the joints."""
     kind: str
+    """motor, position or velocity."""
     path: tuple[str, ...]
+    """Key of the term in the configuration."""
 
 
 class SceneJoints:
@@ -66,12 +71,12 @@ class SceneJoints:
                     self._add_actuator(entity, joint, "motor")
 
     def override(self, name: str, entity: EntityConfig, *, degrees: bool) -> None:
-        """Write the entity's `joints` settings into the model.
+        """Write the entity's settings `joints` into the model.
 
         Args:
             name: name of the entity.
             entity: configuration of the entity.
-            degrees: whether its MJCF has angles in degrees instead of radians.
+            degrees: whether the entity's MJCF has angles in degrees instead of radians.
         """
         if not entity.joints:
             return  # looking through the joints of the whole scene would take long in a scene of many entities
@@ -94,7 +99,7 @@ class SceneJoints:
             for joint in [names[position] for position in self._match(path, config.joints, names)]:
                 if joint in owner:
                     self._problems.append(
-                        SceneProblem(path, f"joint '{joint}' belongs to '{owner[joint]}' already; remove one")
+                        SceneProblem(path, f"joint '{joint}' belongs to '{owner[joint]}' already; remove it from one")
                     )
                     continue
                 owner[joint] = key
@@ -105,7 +110,7 @@ class SceneJoints:
                 motor.set_to_motor()
 
     def _match(self, path: tuple[str, ...], patterns: str | list[str], names: list[str]) -> list[int]:
-        """Return the indices of the names that match; for a wrong pattern, add a problem with the key `path`."""
+        """Return the indices of the names that match; for a wrong pattern, add a problem at `path` and return []."""
         try:
             return match(patterns, names, "joint")
         except NameProblem as problem:
@@ -113,7 +118,7 @@ class SceneJoints:
             return []
 
     def _set_gains_and_limits(self, joint: str, change: JointConfig) -> None:
-        """Set the gains and effort limits that `change` has on the actuators of a joint."""
+        """Write the gains and the effort limit in `change` to the actuators of a joint."""
         for actuator in self._spec.actuators:
             if actuator.target != joint or actuator.trntype != mujoco.mjtTrn.mjTRN_JOINT:
                 continue

@@ -23,7 +23,9 @@ _SMALLEST_RANGE = math.radians(2.0 * math.pi)
 def doubtful_limits(
     model: mujoco.MjModel, joints: Sequence[int], names: Sequence[str]
 ) -> Iterator[tuple[str, str, float]]:
-    """Return a message, a hint and the largest angle [rad] for hinge limits that are probably in the wrong unit.
+    """Yield a message, a hint and the largest angle [rad] for hinge limits that are probably in the wrong unit.
+
+    There is at most one item for limits that are too large, and one for limits that are too small.
 
     Args:
         model: the compiled model.
@@ -49,7 +51,7 @@ def _largest(hinges: Sequence[tuple[str, NDArray[np.float64]]]) -> float:
 
 
 def _first(hinges: Sequence[tuple[str, NDArray[np.float64]]]) -> str:
-    """Return the limits of the first joint, and the names of the others with limits like these."""
+    """Return, as text, the limits of the first joint, and the names of the other joints in the list."""
     (name, (low, high)), others = hinges[0], [name for name, _ in hinges[1:]]
     also = f" (likewise: {listing(others, 3)})" if others else ""
     return f"joint '{name}' has the limits {low:.4g} to {high:.4g} rad{also}"

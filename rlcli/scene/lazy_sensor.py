@@ -33,7 +33,7 @@ class LazySensor(ABC):
         """Compute again the values of environments whose bodies were moved, if values have been read in this step."""
 
     def close(self) -> None:
-        """Do nothing: the sensor holds no resources."""
+        """Free the resources of the sensor; a sensor without resources does nothing."""
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return an empty dictionary: the values follow from the state of the bodies."""

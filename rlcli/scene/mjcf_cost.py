@@ -1,4 +1,4 @@
-"""Estimate of the cost (time and memory) of compiling an untrusted MJCF; an ordinary element costs 1.
+"""Estimate the cost (time and memory) of compiling an untrusted MJCF; an ordinary element costs 1.
 
 `mjcf_safety_check` adds up the costs, and refuses a model that is too expensive.
 """
@@ -47,7 +47,7 @@ class ModelCost:
     referring: float = 0.0
     """Number of elements such as sensors and actuators, which refer to others."""
     stored: dict[str, float] = field(default_factory=dict)
-    """Name of a size, such as `nuser_geom` -> number of user values that MuJoCo stores with each element (geom)."""
+    """Name of an array, such as `nuser_geom` -> number of user values that MuJoCo stores with each element (geom)."""
     keys: float = 0.0
     """Number of keyframes."""
     assets: float = 0.0
@@ -60,7 +60,7 @@ class ModelCost:
         return min(self.size + self.assets + self.loads + self.elements * per_element / 1_000, ENDLESS)
 
     def beside(self, other: ModelCost) -> ModelCost:
-        """Return the cost of a model that has the elements of both."""
+        """Return the cost of a model that has the elements of this model and of `other`."""
         names = self.stored.keys() | other.stored.keys()
         return ModelCost(
             min(self.size + other.size, ENDLESS),
@@ -81,8 +81,8 @@ class ModelCost:
 
         Args:
             copies: number of copies.
-            with_loads: whether the result has `loads`, which does not grow with the copies; False if the caller has
-                counted it already.
+            with_loads: whether the result has `loads`, which does not grow with the number of copies; False if the
+                caller has counted `loads` already.
         """
         grows = ("size", "elements", "referring", "keys", "assets")
         scaled = {name: min(getattr(self, name) * copies, ENDLESS) for name in grows}
@@ -99,13 +99,13 @@ class References:
     _copies: dict[str, float] = field(default_factory=dict)
     """Name of an element -> its number of replicas."""
     _used: list[tuple[str, tuple[str, ...]]] = field(default_factory=list)
-    """(name of an element that refers to others, or of the tendon, tuple or skin it is in; names of those others)."""
+    """(name of a referring element, or of the tendon, tuple or skin around it; names of the elements referred to)."""
 
     def add(self, owner: str, attributes: dict[str, str], copies: float) -> None:
         """Add an element.
 
         Args:
-            owner: name of the element, or, if it has none, of the element around it, such as a joint's tendon.
+            owner: name of the element, or, if the element has no name, of the element around it, such as a tendon.
             attributes: attributes of the element.
             copies: how often `replicate` copies it.
         """
@@ -116,7 +116,7 @@ class References:
             self._used.append((owner, used))
 
     def extend(self, other: References, copies: float) -> None:
-        """Add the elements of an included file, which is copied as often as given."""
+        """Add the elements of an included file, which is copied `copies` times."""
         for name, count in other._copies.items():
             self._copies[name] = max(self._copies.get(name, 1.0), min(count * copies, ENDLESS))
         self._used += other._used
@@ -135,7 +135,10 @@ class References:
 
 
 def stored_arrays(name: str, attributes: dict[str, str]) -> Iterator[tuple[str, float]]:
-    """Yield (name, size) of the user-data arrays that MuJoCo enlarges for all elements because of this element."""
+    """Yield (name, size) of the arrays of user data that MuJoCo enlarges for many elements because of this element.
+
+    `name` is the tag of the element. For the names of arrays see `ModelCost.stored`.
+    """
     if name == "size":
         for key in attributes:
             if key.startswith(("nuser_", "nkey")):

@@ -1,6 +1,6 @@
-"""Check of an untrusted MJCF before MuJoCo opens it.
+"""Check an untrusted MJCF before MuJoCo opens the file.
 
-It parses the XML, checks the files that the model loads, and estimates the cost of compiling it.
+The XML is parsed, the files that the model loads are checked, and the cost of compiling the model is estimated.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _MAX_ATTRIBUTES = 200
 _MAX_LOOKUPS = 50_000
 """Largest product of the number of assets and the number of folders in which MuJoCo may look for them."""
 _LOOKUP_COST = 0.2
-"""Cost of one element that refers to others, for each replica of any element: MuJoCo looks at it again."""
+"""Cost of an element that refers to others, for each replica in the model: MuJoCo resolves the references again."""
 _TEXT = (".xml", ".mjcf", ".urdf")
 _LARGEST_NUMBER = 1e30
 """Largest absolute value of a number in MJCF, except in ranges: products of a few larger numbers are infinite."""
@@ -68,13 +68,13 @@ class BadModel(ValueError):
 
 @dataclass(slots=True)
 class _Text:
-    """Content of one MJCF file: its cost without the files that it includes or attaches, and these files."""
+    """Content of one MJCF file: its cost without included and attached files, and the list of these files."""
 
     cost: float = 0.0
     elements: float = 0.0
     """Number of elements after replication."""
     assets: float = 0.0
-    """Cost of the meshes and images that it loads."""
+    """Cost of the meshes and images that the file loads."""
     stored: dict[str, float] = field(default_factory=dict)
     """Name -> largest size of the arrays that MuJoCo stores with every element of the model, see `ModelCost.stored`."""
     keys: float = 0.0
@@ -95,13 +95,16 @@ class _Text:
 
 @dataclass(slots=True)
 class MjcfScan:
-    """Check of an MJCF (`main`) and of all files that it includes or loads; all must lie in the folders `roots`."""
+    """Check of an MJCF, and of all files that it includes or loads."""
 
     main: Path
+    """The MJCF."""
     roots: list[Path]
+    """Folders in which all files must lie."""
     limited: bool = True
     """Whether a model that costs more than `MAX_COST` is refused."""
     costliest: str = ""
+    """The most expensive part of the model, as text for the message."""
     versions: dict[Path, tuple[int, int]] = field(default_factory=dict)
     """Modification time [ns] and size [bytes] of each file."""
     _max_cost: float = 0.0
@@ -126,7 +129,7 @@ class MjcfScan:
         if len(self._assets) > _MAX_FILES:
             raise BadModel(f"{self.main}: loads more than {_MAX_FILES} files; use fewer meshes and textures")
         if len(self._assets) * len(self._asset_folders) > _MAX_LOOKUPS:
-            raise BadModel(f"{self.main}: names {len(self._asset_folders)} folders of assets; use fewer")
+            raise BadModel(f"{self.main}: names {len(self._asset_folders)} folders of assets; use fewer folders")
         for source, line, element, name, copies in self._assets:
             for found in self._allowed_files(source, line, element, name):
                 loaded = min(copies * self._asset_cost(found, source, line), ENDLESS)
@@ -149,10 +152,10 @@ class MjcfScan:
             )
 
     def file_of(self, error: str) -> str:
-        """Return the names of the files, as text, in which the error of a MuJoCo message may be.
+        """Return, as text, the names of the files that may contain the mistake that MuJoCo's message `error` describes.
 
-        These files have the words of the message in the line that it names. For elements of included files MuJoCo names
-        line 0; then the whole file is searched.
+        These files have the quoted words of the message in the line that the message names. For elements of included
+        files MuJoCo names line 0; then the whole files are searched.
         """
         place = re.search(r"line (?:number=)?(\d+)", error, re.IGNORECASE)
         number = int(place[1]) if place else 0
@@ -164,7 +167,7 @@ class MjcfScan:
     def _model_cost(self, file: Path, parents: tuple[Path, ...]) -> ModelCost:
         """Return the cost to compile a model together with the models that it attaches.
 
-        `parents` are the models that attach this one, directly or indirectly.
+        `parents` are the models that attach this model, directly or indirectly.
 
         Raises:
             BadModel: if the model attaches itself, on which MuJoCo would crash.
@@ -208,7 +211,7 @@ class MjcfScan:
     def _included(self, file: Path, copies: float, parents: tuple[Path, ...]) -> list[tuple[Path, float, _Text]]:
         """Return (path, number of copies, content) of a file and of the files that it includes.
 
-        `parents` are the files that include this one, directly or indirectly.
+        `parents` are the files that include this file, directly or indirectly.
         """
         if file in parents:
             raise BadModel(f"{file}: the file includes itself; remove this include")
@@ -217,7 +220,7 @@ class MjcfScan:
         for count, other in text.includes:
             found += self._included(other, min(copies * count, ENDLESS), (*parents, file))
             if len(found) > _MAX_FILES:
-                raise BadModel(f"{self.main}: includes more than {_MAX_FILES} files; use fewer")
+                raise BadModel(f"{self.main}: includes more than {_MAX_FILES} files; use fewer files")
         return found
 
     def _read_text(self, file: Path, level: int) -> None:
@@ -228,7 +231,7 @@ class MjcfScan:
         if len(self._texts) >= _MAX_FILES:
             raise BadModel(f"{self.main}: includes more than {_MAX_FILES} files; use fewer files")
         if level > _MAX_LEVELS:
-            raise BadModel(f"{file}: is included more than {_MAX_LEVELS} levels deep; use fewer levels")
+            raise BadModel(f"{file}: is included through more than {_MAX_LEVELS} files; use fewer levels of includes")
         text = self._texts[file.resolve()] = _Text()
         try:
             data, status = read_plain(file, _MAX_TEXT), file.stat()
@@ -247,9 +250,11 @@ class MjcfScan:
         def start(name: str, attributes: dict[str, str]) -> None:
             line = parser.CurrentLineNumber
             if len(copies) > _MAX_DEPTH:
-                raise BadModel(f"{file}:{line}: nested deeper than {_MAX_DEPTH} elements; use fewer levels")
+                raise BadModel(f"{file}:{line}: elements are nested deeper than {_MAX_DEPTH} levels; use fewer levels")
             if len(attributes) > _MAX_ATTRIBUTES:
-                raise BadModel(f"{file}:{line}: the element has over {_MAX_ATTRIBUTES} attributes; remove some")
+                raise BadModel(
+                    f"{file}:{line}: the element has more than {_MAX_ATTRIBUTES} attributes; remove some attributes"
+                )
             _check_numbers(file, line, name, attributes)
             if name == "plugin" and not (attributes.get("plugin") or attributes.get("instance")):
                 raise BadModel(
@@ -292,10 +297,10 @@ class MjcfScan:
                 elif key != "filename" or name in ("mesh", "texture"):
                     self._assets.append((file, line, name, value, copies[-1]))
                 if len(files) > _MAX_FILES:
-                    raise BadModel(f"{self.main}: includes more than {_MAX_FILES} files; use fewer")
+                    raise BadModel(f"{self.main}: includes more than {_MAX_FILES} files; use fewer files")
 
         def refuse(*_: Any) -> None:
-            raise BadModel(f"{file}:{parser.CurrentLineNumber}: a DOCTYPE is not allowed; remove it")
+            raise BadModel(f"{file}:{parser.CurrentLineNumber}: a DOCTYPE is not allowed; remove the DOCTYPE")
 
         parser.StartElementHandler = start
         parser.EndElementHandler = lambda name: (copies.pop(), names.pop())
@@ -329,7 +334,7 @@ class MjcfScan:
     def _allowed_files(self, file: Path, line: int, element: str, name: str) -> Iterator[Path]:
         """Yield the existing files that MuJoCo may open for the file name in an element of an MJCF."""
         if "\0" in name or "://" in name:
-            raise BadModel(f"{file}:{line}: {element}: '{name}' is not a file name; correct it")
+            raise BadModel(f"{file}:{line}: {element}: '{name}' is not a file name; write the path of a file")
         seen: set[Path] = set()
         # MuJoCo looks in the folder of the main file and of the including one, with and without an asset folder
         folders = [base / inner for base in (self.main.parent, file.parent) for inner in self._asset_folders]
@@ -342,7 +347,8 @@ class MjcfScan:
                     continue
                 if not inside and (Path(part).is_absolute() or path.exists()):
                     where = " and ".join(str(root) for root in dict.fromkeys(self.roots))
-                    raise BadModel(f"{file}:{line}: {element}: '{name}' lies outside of {where}; move it inside")
+                    message = f"{file}:{line}: {element}: '{name}' lies outside of {where}"
+                    raise BadModel(f"{message}; move the file into this folder")
             except (OSError, RuntimeError) as error:
                 raise BadModel(f"{file}:{line}: {element}: '{name}': {error}") from None
             if inside:
@@ -355,7 +361,7 @@ class MjcfScan:
         size = (status := path.stat()).st_size
         self.versions[path] = (status.st_mtime_ns, size)
         if size > _MAX_ASSET:
-            raise BadModel(f"{file}:{line}: '{path}' is too large; allowed are {_MAX_ASSET:,} bytes")
+            raise BadModel(f"{file}:{line}: '{path}' is too large; at most {_MAX_ASSET:,} bytes are allowed")
         cost = size / 20_000
         with path.open("rb") as opened:
             head = opened.read(24)
@@ -365,7 +371,7 @@ class MjcfScan:
 
 
 def _has_words(file: Path, number: int, words: Sequence[str]) -> bool:
-    """Return whether line `number` of a file (0: the whole file) has these words."""
+    """Return whether line `number` of a file (0: the whole file) has all words."""
     text = read_plain(file, _MAX_TEXT).decode("utf-8", "replace")
     lines = text.splitlines()
     part = text if number == 0 else lines[number - 1] if number <= len(lines) else ""
@@ -377,7 +383,7 @@ def _check_numbers(file: Path, line: int, name: str, attributes: dict[str, str])
     for key, value in attributes.items():
         limit = MAX_MEMORY if key == "memory" else 1_000_000
         if name == "size" and number_of(value) > limit:
-            raise BadModel(f'{file}:{line}: size {key}="{value[:40]}" is too large; {limit:,} is allowed')
+            raise BadModel(f'{file}:{line}: size {key}="{value[:40]}" is too large; at most {limit:,} is allowed')
         found = f'{file}:{line}: {name} {key}="{shorten(value, 40)}"'
         dissipates = key in _NOT_NEGATIVE or (key == "damping" and name in ("joint", "tendon", "spatial", "fixed"))
         if dissipates and any(mjcf_number(word) < 0 for word in value.split()):
@@ -387,6 +393,6 @@ def _check_numbers(file: Path, line: int, name: str, attributes: dict[str, str])
         for word in value.split():
             number = mjcf_number(word)
             if (math.isnan(number) and _PERHAPS_WRONG.match(word)) or (math.isinf(number) and "range" not in key):
-                raise BadModel(f"{found} is not finite; give a number")
+                raise BadModel(f"{found} is not finite; give a finite number")
             if abs(number) > _LARGEST_NUMBER and "range" not in key:
-                raise BadModel(f"{found} is too large; {_LARGEST_NUMBER:g} is allowed")
+                raise BadModel(f"{found} is too large; at most {_LARGEST_NUMBER:g} is allowed")

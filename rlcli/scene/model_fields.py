@@ -1,6 +1,6 @@
-"""Access to the fields of MjModel, such as body_mass, whose values may differ between environments.
+"""Read and set fields of MjModel, such as body_mass, whose values may differ between environments.
 
-Events for domain randomization and stress tests write to them.
+Events for domain randomization and stress tests set these fields.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ DERIVED_FROM = {
     *("geom_margin", "geom_gap", "site_pos", "site_quat", "actuator_gear"),
     *("tendon_stiffness", "tendon_damping", "tendon_armature"),
 }
-"""Fields from which MuJoCo derives constants: after a write to one, `Engine.set_constants` must be called."""
+"""Fields from which MuJoCo derives constants: after a change of such a field, `Engine.set_constants` must be called."""
 
 
 class ModelField:
@@ -81,16 +81,19 @@ class ModelField:
         """Values of the compiled model. (elements, axes)"""
 
     def write(self, selection: Selection, values: Tensor) -> None:
-        """Set the values in the selected environments, one row for each of them. (rows, elements, axes)"""
+        """Set the values in the selected environments; `values` has a row for each of them. (rows, elements, axes)"""
         selection.write(self.values, values.to(self.values.dtype).flatten(1), self.columns)
 
     def read(self, selection: Selection) -> Tensor:
-        """Return the values in the selected environments, one row for each of them. (rows, elements, axes)"""
+        """Return the values in the selected environments, a row for each environment. (rows, elements, axes)"""
         return selection.read(self.values, self.columns).view(-1, *self.shape)
 
 
 def element_ids(entity: Entity, name: str, elements: Columns) -> list[int]:
-    """Return the rows of the model field `name` that belong to some elements of an entity, in the same order."""
+    """Return the rows of the model field `name` that belong to some elements of an entity, in the order of `elements`.
+
+    `elements` is an index into the entity's elements (bodies, joints, ...), by the kind in `FIELDS`.
+    """
     if name in ("qpos0", "qpos_spring"):
         rows = entity.qpos_columns.cpu()
     elif name.startswith("dof_"):

@@ -1,6 +1,6 @@
-"""Function that names all elements of a model which have no name.
+"""Give a name to every element of a model that has none.
 
-The scene uses it, and so does the subprocess that compiles untrusted models.
+The scene calls the function, and so does the subprocess that compiles untrusted models.
 """
 
 import mujoco

@@ -1,6 +1,6 @@
-"""Search for the elements of a model (joints, bodies, ...) whose names match a name or regular expression.
+"""Find the elements of a model (joints, bodies, ...) whose names match a name or a regular expression.
 
-The time of a regular expression is limited, because it may come from an untrusted task.
+Regular expressions that could take long are refused, because they may come from an untrusted task.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class SceneProblem(NameProblem):
 
 
 def match(patterns: str | Sequence[str], names: Sequence[str], what: str) -> list[int]:
-    """Return the indices of the names that match one of the patterns completely.
+    """Return the indices of the names that equal a pattern, or that a pattern matches completely.
 
     The indices are in the order of the patterns; matches of one regular expression are in the order of `names`.
 
@@ -84,7 +84,7 @@ def match_values(values: Mapping[str, Value], names: Sequence[str], what: str) -
         for position in match(pattern, names, what):
             if position in owner:
                 raise NameProblem(
-                    f"'{owner[position]}' and '{pattern}' both match {what} '{names[position]}'; narrow one of them"
+                    f"'{owner[position]}' and '{pattern}' both match {what} '{names[position]}'; narrow one pattern"
                 )
             owner[position] = pattern
             found[position] = value
@@ -103,7 +103,7 @@ def search(pattern: str, names: Sequence[str], what: str) -> list[int]:
             warnings.simplefilter("error")  # Python warns about `[` within a set
             regex = re.compile(pattern)
     except (re.error, OverflowError, RecursionError, FutureWarning) as error:
-        message = f"'{pattern}' is neither the name of a {what} nor a regular expression ({error}); correct it"
+        message = f"'{pattern}' is neither the name of a {what} nor a regular expression ({error}); correct the text"
         raise NameProblem(message) from None
     return [position for position, name in enumerate(names) if regex.fullmatch(name)]
 
@@ -152,7 +152,7 @@ def _require_cheap(pattern: str, length: int) -> None:
         NameProblem: if the pattern is too long or too costly.
     """
     if len(pattern) > _MAX_PATTERN:
-        raise NameProblem(f"the pattern has {len(pattern):,} characters; at most {_MAX_PATTERN:,} are allowed")
+        raise NameProblem(f"a pattern has {len(pattern):,} characters; at most {_MAX_PATTERN:,} are allowed")
     parts = [_Part()]
     for token in _TOKEN.findall(pattern):
         part = parts[-1]
@@ -183,5 +183,6 @@ def _require_cheap(pattern: str, length: int) -> None:
     repeats, options = parts[0].most()
     if min(math.comb(length + repeats, repeats), 10**9) * 2.0 ** min(options, 100) > _MAX_STEPS:
         raise NameProblem(
-            f"the pattern '{pattern}' has {repeats + options} of the quantifiers * + ? {{m,n}}; use fewer"
+            f"the pattern '{pattern}' has {repeats + options} of the quantifiers * + ? {{m,n}}, which can take more"
+            " than a second; use fewer quantifiers"
         )

@@ -1,6 +1,6 @@
-"""Random poses of a robot, and the positions that one of its bodies reaches in them, by forward kinematics.
+"""Compute positions that a body of a robot can reach, by forward kinematics of random poses.
 
-Commands sample reachable goals from these positions.
+Command terms sample reachable goals from these positions.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def reachable_positions(
 
 
 def _digest(model: mujoco.MjModel, numbers: NDArray[np.float64]) -> bytes:
-    """Return a digest of a compiled model, meshes and names included, and of an array."""
+    """Return a digest of a compiled model, including meshes and names, and of an array of numbers."""
     content = np.zeros(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, content)
     return hashlib.blake2b(numbers.tobytes(), key=hashlib.blake2b(content.tobytes()).digest()).digest()
@@ -98,7 +98,10 @@ def random_poses(
 
 
 def follow_coupled_joints(model: mujoco.MjModel, poses: NDArray[np.float64], joints: Sequence[int]) -> None:
-    """Set in `poses`, (n, nq), the positions of joints that an equality of the MJCF couples to one of `joints`."""
+    """Set the positions of joints that an equality of the MJCF couples to one of `joints`, in `poses` in place.
+
+    `poses` has a pose (qpos) in each row, (n, nq); `joints` are ids of joints whose positions are set.
+    """
     for follower, leader, coefficients in coupled_joints(model):
         own, other = model.jnt_qposadr[follower], model.jnt_qposadr[leader]
         if leader in joints:
@@ -109,7 +112,8 @@ def follow_coupled_joints(model: mujoco.MjModel, poses: NDArray[np.float64], joi
 def coupled_joints(model: mujoco.MjModel) -> list[tuple[int, int, NDArray[np.float64]]]:
     """Return (follower, leader, polynomial coefficients) of each active equality between two joints.
 
-    The follower is the joint whose position is the polynomial of the leader's position. Both are ids of joints.
+    Follower and leader are ids of joints. The offset of the follower from its position in qpos0 is the polynomial of
+    the leader's offset; the constant coefficient is the first.
     """
     between = (model.eq_type == int(mujoco.mjtEq.mjEQ_JOINT)) & (model.eq_obj2id >= 0) & (model.eq_active0 != 0)
     return [(int(model.eq_obj1id[e]), int(model.eq_obj2id[e]), model.eq_data[e, :5]) for e in np.flatnonzero(between)]

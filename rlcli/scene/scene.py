@@ -1,4 +1,4 @@
-"""Class `Scene`: construction of a task's MuJoCo model from its configuration.
+"""Class `Scene`, which builds a task's MuJoCo model from the configuration.
 
 It attaches robots and objects, adds ground, lights, sensors and terrain, and compiles the model.
 """
@@ -39,8 +39,14 @@ View = TypeVar("View")
 class Scene:
     """Scene of a task while its MuJoCo model is built from the configuration.
 
-    `spec` is the model, an MjSpec, which a direct task may change in `set_up_scene`, before it is compiled. `problems`
-    collects the mistakes in the configuration.
+    `spec` is the MjSpec of the model, which a direct task may change in `set_up_scene`, before `compile` is called.
+    `problems` collects the mistakes in the configuration.
+
+    Args:
+        config: the section `scene` of the task.
+        sim: the section `sim` of the task.
+        root: the task's folder, which has its models.
+        installed: whether the task is installed: the files of an installed task are trusted.
     """
 
     def __init__(self, config: SceneConfig, sim: SimConfig, root: Path, *, installed: bool = False) -> None:
@@ -78,7 +84,8 @@ class Scene:
         """Compile the scene to an MjModel, for the CPU engine or (`on_cpu` false) for MuJoCo Warp.
 
         Raises:
-            ConfigError: if MuJoCo refuses the model.
+            ConfigError: if MuJoCo cannot compile the model.
+            MachineError: if memory is too small.
         """
         try:
             # MuJoCo warns about options of the MJCF that `sim` overrides
@@ -94,7 +101,10 @@ class Scene:
         return model
 
     def broken_models(self) -> Iterator[SceneProblem]:
-        """Compile the model of each entity by itself; yield a problem, with the file, for each that fails."""
+        """Compile the model of each entity by itself, and yield a problem, with the file, for each model that fails.
+
+        After a failed `compile`, this shows which model is the cause.
+        """
         for name, checked in self._models.items():
             try:
                 entity_spec(name, self.config.entities[name], checked, compiled=True)
@@ -145,7 +155,7 @@ class Scene:
         self.joints.add_motors_of_actuator_models(name, entity)
 
     def _set_options(self) -> None:
-        """Set the physics options that the key `sim` of the task has; they override those of the MJCF."""
+        """Set the physics options of the task's section `sim`; they override the options of the MJCF."""
         option = self.spec.option
         option.timestep = self.sim.dt
         option.gravity = self.sim.gravity

@@ -1,6 +1,7 @@
-"""Builder that adds the sensors of a task to the model of its scene.
+"""Add the sensors of a task to the model of its scene, before the model is compiled.
 
-For each sensor it returns a specification, from which `rlcli.scene.sensors` makes the object that reads the sensor.
+For each sensor `SensorBuilder` returns a specification, from which `rlcli.scene.sensors` makes the object that reads
+the sensor.
 """
 
 from __future__ import annotations
@@ -27,43 +28,48 @@ _DRAWN_GROUPS = (0, 1, 2)
 
 @dataclass(frozen=True, slots=True)
 class ContactSensorSpec:
-    """Contact sensor, as it was added to the model.
-
-    `bodies` are the names of its bodies, `sensors` the names of the MJCF sensors of each body, whose forces are added.
-    """
+    """Specification of a contact sensor that was added to the model."""
 
     config: ContactSensorConfig
     bodies: list[str]
+    """Names of the bodies, without the entity."""
     sensors: list[list[str]]
+    """Names of the MJCF sensors of each body, whose forces are added up."""
 
 
 @dataclass(frozen=True, slots=True)
 class RaySensorSpec:
-    """Ray sensor, as it was added to the model: the full name of its body, and the geom groups that rays can hit.
-
-    `groups` is None if rays can hit all groups.
-    """
+    """Specification of a ray sensor that was added to the model."""
 
     config: RaySensorConfig
     body: str
+    """Full name of the sensor's body, `entity/body`."""
     groups: tuple[int, ...] | None
+    """Geom groups that rays can hit; None: all groups."""
     ground: Ground | None = None
     """Terrain in which heights are looked up instead of casting rays; None: cast rays."""
 
 
 @dataclass(frozen=True, slots=True)
 class CameraSensorSpec:
-    """Camera sensor, as it was added to the model: the full name of its camera."""
+    """Specification of a camera sensor that was added to the model."""
 
     config: CameraSensorConfig
     camera: str
+    """Full name of the camera in the model."""
 
 
 SensorSpec = ContactSensorSpec | RaySensorSpec | CameraSensorSpec
 
 
 class SensorBuilder:
-    """Builder that adds sensors to the model of a scene, after its entities and its ground."""
+    """Builder that adds sensors to the model of a scene, which already has its entities and its ground.
+
+    Args:
+        spec: the model.
+        entities: configuration of each entity.
+        ground: the generated terrain; None: the scene has none.
+    """
 
     def __init__(self, spec: mujoco.MjSpec, entities: Mapping[str, EntityConfig], ground: Ground | None) -> None:
         self._spec = spec
@@ -71,7 +77,7 @@ class SensorBuilder:
         self._ground = ground
 
     def add(self, name: str, config: SensorConfig) -> SensorSpec:
-        """Add a sensor to the model, and return its specification. `name` is its name in the task.
+        """Add a sensor to the model, and return its specification. `name` is the sensor's name in the task.
 
         Raises:
             SceneProblem: if the configuration does not fit the models.
@@ -163,11 +169,11 @@ class SensorBuilder:
         return CameraSensorSpec(config, prefix + config.camera)
 
     def _body(self, entity: str, pattern: str | None, path: tuple[str, ...]) -> str:
-        """Return the full name, `entity/body`, of the one body that matches a pattern, or of the root for None."""
+        """Return the full name, `entity/body`, of the body that matches a pattern; of the root if `pattern` is None."""
         bodies = self._bodies(entity, ".*" if pattern is None else pattern, path, "body")
         if pattern is not None and len(bodies) > 1:
             short = listing([body.removeprefix(f"{entity}/") for body in bodies])
-            raise SceneProblem((*path, "body"), f"'{pattern}' matches several bodies: {short}", "name one of them")
+            raise SceneProblem((*path, "body"), f"'{pattern}' matches several bodies: {short}", "name one body")
         return bodies[0]
 
     def _bodies(self, entity: str, patterns: str | list[str], path: tuple[str, ...], key: str) -> list[str]:
@@ -197,7 +203,10 @@ class SensorBuilder:
         return [geom for geom in self._spec.worldbody.geoms if geom.name == "ground"]
 
     def _group_of_ground(self, path: tuple[str, ...]) -> int:
-        """Move the ground to a geom group without other geoms, and return the group: rays select geoms by group."""
+        """Move the ground to a geom group without other geoms, and return the group, by which rays select the ground.
+
+        `path` is the sensor's key in the configuration, for messages.
+        """
         ground = self._ground_geoms()
         if not ground:
             raise SceneProblem(path, "the scene has no ground", "add scene.ground or scene.terrain, or write sees: all")
@@ -215,7 +224,7 @@ class SensorBuilder:
 def _look_rotation(ray: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the orientation (w, x, y, z) of a camera that looks along a ray, with the world's z axis up.
 
-    A camera looks along its own -z axis. If the ray is parallel to the world's z axis, x is used for up.
+    A camera looks along its own -z axis. If the ray is parallel to the world's z axis, the world's x axis is up.
     """
     back = -ray / np.linalg.norm(ray)
     right = np.cross([0.0, 0.0, 1.0], back)

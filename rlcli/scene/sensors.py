@@ -1,6 +1,6 @@
-"""Contact sensors and ray sensors of a scene; a reading is a tensor with one row for each environment.
+"""Contact sensors and ray sensors of a scene, whose readings are tensors with one row for each environment.
 
-Terms read them by the names in the section `scene.sensors`.
+Terms find a sensor by its name in the section `scene.sensors`.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class ContactSensor(TensorState):
         self.force_history = torch.zeros(n, spec.config.history, k, 3, device=device)
         """Net contact force on each body over the last steps, newest first, world frame. (num_envs, h, k, 3) [N]"""
         self.force = self.force_history[:, 0]
-        """Net contact force on each body in the last substep, world frame. (num_envs, k, 3) [N]"""
+        """Net contact force on each body in the last physics step, world frame. (num_envs, k, 3) [N]"""
         self.air_time = times[0]
         """Time for which each body has been in the air; 0 in contact. (num_envs, k) [s]"""
         self.contact_time = times[1]
@@ -74,7 +74,7 @@ class ContactSensor(TensorState):
         """Whether each body is in contact. (num_envs, k)"""
 
     def update(self, dt: float) -> None:
-        """Update forces and times after an environment step of `dt` seconds."""
+        """Read the contact forces, and update the times, after an environment step of `dt` seconds."""
         for age in range(self.force_history.shape[1] - 1, 0, -1):
             self.force_history[:, age] = self.force_history[:, age - 1]
         force, found = self._measure(self._sim.derived_field("sensordata"))
@@ -102,13 +102,13 @@ class ContactSensor(TensorState):
             selection.write(self.found, found)
 
     def on_moved(self, selection: Selection) -> None:
-        """Do nothing: forces are those of the last step, also if an event has moved the bodies since."""
+        """Do nothing: the forces stay those of the last step, even if an event has moved the bodies since then."""
 
     def close(self) -> None:
         """Do nothing: the sensor holds no resources."""
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return the tensors that are saved in a checkpoint."""
+        """Return the tensors that are saved in a checkpoint, by name."""
         return {name: getattr(self, name) for name in _STATE_NAMES}
 
     def _measure(self, sensordata: Tensor) -> tuple[Tensor, Tensor]:
@@ -190,7 +190,8 @@ class RaySensor(LazySensor):
         if float(distances.max()) > 1e-4:
             ray, body = int(distances.argmax()), self._config.body
             message = f"ray {ray} of the ray sensor on body '{body}' has no mirror image"
-            raise TaskError(message, hint="make its pattern symmetric about the x-z plane or set symmetry: null")
+            hint = "make the sensor's pattern symmetric about the x-z plane, or set symmetry: null for the agent"
+            raise TaskError(message, hint=hint)
         found: list[int] = partners.tolist()
         return found
 
@@ -212,7 +213,8 @@ class RaySensor(LazySensor):
     def _rays(self, position: Tensor, quat: Tensor, selection: Selection | None = None) -> tuple[Tensor, ...]:
         """Cast the rays from poses of the sensor's body.
 
-        Return distances, misses, sensor positions, and x, y and z of the end points: the new values of `_buffers`.
+        Return the new values of `_buffers`: distances (rows, r), misses (rows, r), positions of the sensor (rows, 3),
+        and x, y and z of the end points (rows, r).
 
         Args:
             position: position of the body, world frame. (rows, 3) [m]
@@ -237,9 +239,9 @@ class RaySensor(LazySensor):
         return distance, missed, position, *(points + directions * distance[..., None]).unbind(2)
 
     def _down_from(self, position: Tensor, axes: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-        """Return x and y of the start points of rays straight down, (rows, r) each, and their height (rows, 1) [m].
+        """Return x and y of the start points of rays straight down, (rows, r) each, and their z, (rows, 1) [m].
 
-        `position` is that of the sensor's body, `axes` as in `_axes`.
+        `position` is the position of the sensor, world frame (rows, 3) [m]; for `axes` see `_axes`.
         """
         ahead, left, _ = self._starts.unbind(1)
         x, y, z = position[:, None].unbind(2)
@@ -251,7 +253,7 @@ class RaySensor(LazySensor):
         return turned_x.add_(x), turned_y.add_(y), z
 
     def _pose(self) -> tuple[Tensor, Tensor]:
-        """Return position (num_envs, 3) and orientation (num_envs, 4) of the sensor's body."""
+        """Return position (num_envs, 3) [m] and quaternion (num_envs, 4) of the sensor's body, world frame."""
         if self._root is not None:
             qpos = self._sim.qpos
             return qpos[:, self._root : self._root + 3], qpos[:, self._root + 3 : self._root + 7]
@@ -260,7 +262,7 @@ class RaySensor(LazySensor):
     def _axes(self, quat: Tensor) -> Tensor | None:
         """Return the axes of the sensor's frame in the world, from the orientation of its body. (rows, 3, 3)
 
-        The axes are the rows of a matrix for each environment; None: they are the world's axes.
+        The axes are the rows of a matrix for each environment; None: the axes are those of the world.
         """
         if self._config.alignment == "world":
             return None
@@ -279,7 +281,7 @@ Sensor = ContactSensor | RaySensor | CameraSensor
 
 
 def make_sensors(specs: Mapping[str, SensorSpec], sim: SimData, entities: Mapping[str, Entity]) -> dict[str, Sensor]:
-    """Make the objects that read the sensors of a compiled scene, by name, in the order of `specs`."""
+    """Return the objects that read the sensors of a compiled scene, by name, in the order of `specs`."""
     cameras = {name: spec for name, spec in specs.items() if isinstance(spec, CameraSensorSpec)}
     sensors: dict[str, Sensor] = dict(make_cameras(cameras, sim.engine))
     for name, spec in specs.items():
@@ -303,7 +305,10 @@ def _pattern(config: RaySensorConfig) -> tuple[Tensor, Tensor]:
 
 
 def _line(size: float, resolution: float) -> Tensor:
-    """Return the coordinates of points on a line, centred at 0: every `resolution`, as many as fit in `size` [m]."""
+    """Return the coordinates of points on a line, centred at 0 [m].
+
+    The distance of the points is `resolution`; as many points as possible lie within the length `size` [m].
+    """
     count = math.floor(size / resolution + 1e-6) + 1
     return (torch.arange(count) - (count - 1) / 2) * resolution
 

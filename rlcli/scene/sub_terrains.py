@@ -1,4 +1,4 @@
-"""Generators of the kinds of ground (stairs, slopes, waves, ...), each for one patch (square piece) of a terrain.
+"""Generate one patch (rectangular piece) of a terrain with a kind of ground: stairs, slopes, waves, and so on.
 
 A patch is an array of heights [m] at the corners of its cells, with x along the first axis. The heights along its edges
 are 0, so that any two patches fit together.
@@ -30,7 +30,7 @@ class Block:
 
 @dataclass(frozen=True, slots=True)
 class PatchSite:
-    """Size, resolution, difficulty and random generator of one patch of terrain: the same for all kinds of ground."""
+    """Size, resolution, difficulty and random generator of one patch of terrain, for any kind of ground."""
 
     size: tuple[float, float]
     """Extent along x and y [m]."""
@@ -102,7 +102,7 @@ def shifted(block: Block, offset: tuple[float, float]) -> Block:
 
 
 def ring(outer: Block, inner: Block) -> list[Block]:
-    """Return four blocks that fill the area between two rectangles; they have the height of the outer rectangle."""
+    """Return four blocks that fill the area between two rectangles; the blocks have the height of `outer`."""
     (x0, y0), (x1, y1) = outer.low, outer.high
     (left, front), (right, back) = inner.low, inner.high
     return [
@@ -164,7 +164,7 @@ def _stones(config: schema.StonesPatchConfig, site: PatchSite) -> Heights:
 
 
 def _stairs(config: schema.StairsPatchConfig, site: PatchSite) -> list[Block]:
-    """Return stairs on four sides: for each step a ring of four blocks, from the outside inwards, and a platform."""
+    """Return the blocks of stairs on four sides: a ring of four for each step, from outside inwards, and a platform."""
     rise = site.at_difficulty(config.step_height) * (-1.0 if config.inverted else 1.0)
     steps = int((min(site.size) - config.platform) / 2 / config.step_width + _EPS)
 
@@ -204,7 +204,7 @@ _MAKERS: dict[type[schema.PatchConfig], Callable[[Any, PatchSite], Heights | lis
 
 
 def _edge_distance(site: PatchSite) -> Heights:
-    """Return the distance of every point of the height field of a patch from the nearest edge [m]."""
+    """Return the distance of every point of a patch from the patch's nearest edge [m]. (nx, ny)"""
     x, y = site.axes()
     return np.minimum(np.minimum(x, site.size[0] - x), np.minimum(y, site.size[1] - y))
 
@@ -216,7 +216,7 @@ def _platform_block(platform: float, site: PatchSite) -> Block:
 
 
 def _cover_with_block(heights: Heights, site: PatchSite, block: Block) -> None:
-    """Set the heights of the points that a block covers to the height of its top."""
+    """Set the heights of the points that a block covers to the height of the block's top, in place."""
     x, y = site.axes()
     inside_x = (x[:, 0] >= block.low[0] - _EPS) & (x[:, 0] <= block.high[0] + _EPS)
     inside_y = (y[0] >= block.low[1] - _EPS) & (y[0] <= block.high[1] + _EPS)

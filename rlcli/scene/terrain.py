@@ -1,6 +1,6 @@
-"""Terrain of a scene: generated patches joined in the model, and the start position of each environment.
+"""Terrain of a scene: generate its patches, add them to the model, and assign start positions to environments.
 
-Curriculum terms move environments to harder patches with it.
+Curriculum terms move environments to harder patches by the class `Terrain`.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ TerrainProblem = tuple[tuple[str, ...], str, str | None]
 
 @dataclass(frozen=True, slots=True)
 class Ground:
-    """A generated terrain, before it is added to a model: its height field, its boxes, and the origin of each patch."""
+    """A generated terrain before it is added to a model: its height field, its blocks, and the origin of each patch."""
 
     heights: Heights
     """Heights of the height field, x along the first axis, its middle at the world's origin [m]."""
@@ -68,7 +68,7 @@ class Ground:
 
 
 def terrain_problems(config: TerrainConfig, root: Path) -> Iterator[TerrainProblem]:
-    """Yield the mistakes in a terrain's configuration; `root` is the task's folder, which has files of heights."""
+    """Yield the mistakes in a terrain's configuration; `root` is the task's folder, to which `file` is relative."""
     if isinstance(config, schema.TerrainHeightsConfig):
         yield from _file_problems(config, root)
         return
@@ -123,7 +123,7 @@ def make_ground(config: TerrainConfig, root: Path) -> Ground:
 
 
 def add_ground(spec: mujoco.MjSpec, ground: Ground, material: str) -> None:
-    """Add a terrain to a model: a height field, boxes, and a flat border. `material` is the name of their material."""
+    """Add a terrain to a model: a height field, boxes, and a flat border, all of the material named `material`."""
     body, prefix = spec.worldbody.add_body(name=TERRAIN_BODY), f"//{TERRAIN_BODY}"
     add_geom = functools.partial(body.add_geom, material=material, friction=[ground.friction, 0.005, 0.0001])
     nx, ny = ground.heights.shape
@@ -143,14 +143,15 @@ def add_ground(spec: mujoco.MjSpec, ground: Ground, material: str) -> None:
 
 
 class Terrain:
-    """Start positions of the environments on a terrain. A level is a row of patches, a type is a column.
+    """Start positions of the environments on a terrain. A level is a row of patches, a type is a column of patches.
 
     Args:
         ground: the terrain in the model.
         config: configuration of the terrain.
         origins: start positions of the environments; this object updates them. (num_envs, 3) [m]
         seed: seed of the start levels.
-        streams: index of the random stream of each environment; equal indices have the same start. (num_envs,)
+        streams: index of the random stream of each environment; environments with equal indices start on the same
+            patch. (num_envs,)
     """
 
     def __init__(
@@ -178,7 +179,7 @@ class Terrain:
         return len(self.origins)
 
     def start(self, seed: int) -> None:
-        """Move every environment to its start level, which depends only on the seed and the environment's index."""
+        """Move every environment to its start level, which depends only on the seed and the environment's stream."""
         keys = random.row_keys(seed, self._streams, np.zeros_like(self._streams))
         self.levels.copy_(torch.from_numpy(random.integers(keys, _START, 0, 1, self._start_levels)[:, 0]))
         self._env_origins.copy_(self.origins[self.levels, self.types])
@@ -188,8 +189,8 @@ class Terrain:
 
         Args:
             selection: the environments.
-            up: environments that move up. (rows,) bool
-            down: environments that move down, if `up` does not mark them. (rows,) bool
+            up: whether each selected environment moves up. (rows,) bool
+            down: whether each selected environment moves down; not used where `up` is true. (rows,) bool
         """
         levels = selection.read(self.levels) + up.long() - (down & ~up).long()
         drawn = selection.stream(_MOVE).choice(self.rows)
@@ -204,7 +205,10 @@ class Terrain:
         selection.write(self._env_origins, self.origins[levels, selection.read_view(self.types)])
 
     def place_entities(self, entities: Iterable[Entity], selection: Selection) -> None:
-        """Put floating and mocap entities at their default pose on the patch of the environment."""
+        """Set the root poses of entities to their default pose, moved to the patch of the environment.
+
+        Entities whose root is fixed to the world are left out.
+        """
         for entity in entities:
             if entity.is_floating or entity.mocap >= 0:
                 default = selection.read_view(entity.data.default_root_state)
@@ -242,14 +246,14 @@ def _choose_patch(
 
 
 def _spawn_height(heights: Heights, resolution: float) -> float:
-    """Return the height of the origin of a patch, which is the height of the highest point near its middle [m]."""
+    """Return the height of the origin of a patch [m]: the largest of its heights near the patch's middle."""
     reach = round(_SPAWN_HALF_WIDTH / resolution)
     x, y = (n // 2 for n in heights.shape)
     return float(heights[max(0, x - reach) : x + reach + 1, max(0, y - reach) : y + reach + 1].max())
 
 
 def _heights_below_blocks(patch: Patch) -> Heights:
-    """Return heights for the height field of a patch with boxes, which stay below the boxes [m]."""
+    """Return the heights of the height field below the boxes of a patch [m]."""
     lowest = min(block.top for block in patch.blocks)
     inside = np.zeros_like(patch.heights)
     # 5 cm lower than the blocks, so that no two surfaces are in one plane
@@ -275,13 +279,14 @@ def _patch_problems(patch: schema.PatchConfig, edge: float, resolution: float) -
     """
     platform = getattr(patch, "platform", 0.0)
     if platform >= edge:
-        yield "platform", f"a platform of {platform:g} m does not fit in a patch of {edge:g} m", "make it smaller"
+        message = f"a platform of {platform:g} m does not fit in a patch of {edge:g} m"
+        yield "platform", message, "set a smaller platform"
     for key in ("spacing", "step_width", "cell"):
         if (part := getattr(patch, key, edge)) * _MAX_PARTS < edge:
             yield (
                 key,
                 f"a {key} of {part:g} m divides a patch of {edge:g} m into more than {_MAX_PARTS} parts",
-                "make it larger",
+                f"set a larger {key}",
             )
     fine = "set a smaller resolution, or boxes: true"
     if isinstance(patch, schema.StairsPatchConfig) and not patch.boxes and patch.step_width < 2 * resolution:
@@ -294,7 +299,8 @@ def _patch_problems(patch: schema.PatchConfig, edge: float, resolution: float) -
         yield "cell", f"a cell of {patch.cell:g} m needs a resolution of half that, not {resolution:g} m", fine
     if isinstance(patch, schema.ObstaclesPatchConfig | schema.StonesPatchConfig):
         if patch.width[1] > edge:
-            yield "width", f"a width of {patch.width[1]:g} m does not fit in a patch of {edge:g} m", "make it smaller"
+            message = f"a width of {patch.width[1]:g} m does not fit in a patch of {edge:g} m"
+            yield "width", message, "set a smaller width"
         if patch.width[0] < resolution:
             yield (
                 "width",
@@ -323,7 +329,7 @@ def _file_problems(config: schema.TerrainHeightsConfig, root: Path) -> Iterator[
     """Yield the mistakes in the configuration of a terrain from a file, and in the file, which is in `root`."""
     file = (root / config.file).resolve()
     if not file.is_relative_to(root.resolve()):
-        yield ("file",), f"'{config.file}' lies outside the task's folder {root}", "move it inside"
+        yield ("file",), f"'{config.file}' lies outside the task's folder {root}", "move the file into the folder"
         return
     if not file.is_file():
         files = ", ".join(sorted(str(p.relative_to(root)) for p in root.rglob("*.npy"))) or "none"
@@ -332,7 +338,7 @@ def _file_problems(config: schema.TerrainHeightsConfig, root: Path) -> Iterator[
     try:
         heights = _read_heights(file)
     except (ValueError, OSError) as error:
-        yield ("file",), f"'{config.file}' is not a NumPy file: {error}", "write it with numpy.save"
+        yield ("file",), f"'{config.file}' is not a NumPy file: {error}", "write the file with numpy.save"
         return
     if heights.ndim != 2 or min(heights.shape) < 2:
         found = f"found shape {heights.shape}"

@@ -1,4 +1,4 @@
-"""Reader of untrusted MJCF, with limits on the files that a model may open and on its memory and compile time.
+"""Read untrusted MJCF, with limits on the files that a model may open and on its memory and compile time.
 
 The text is parsed (`mjcf_safety_check`) before MuJoCo reads it. Files that a model includes or loads must lie in the
 folders that its task may read, after links are resolved. The elements that take compile time are counted. Expensive
@@ -52,7 +52,9 @@ class CheckedModel:
 
     file: Path
     cost: ModelCost
+    """Estimate of the cost of compiling the model."""
     scan: MjcfScan
+    """The check, which knows the model's files."""
 
 
 def read_mjcf(file: Path, roots: Sequence[Path], *, installed: bool = False, compiled: bool = False) -> mujoco.MjSpec:
@@ -82,7 +84,7 @@ def check_mjcf(file: Path, roots: Sequence[Path], *, installed: bool = False) ->
     """
     scan = MjcfScan(file, [root.resolve() for root in roots], limited=not installed)
     if not any(file.resolve().is_relative_to(root) for root in scan.roots):
-        raise BadModel(f"{file}: lies outside of {scan.roots[0]}; move it inside")
+        raise BadModel(f"{file}: lies outside of {scan.roots[0]}; move the file into this folder")
     return CheckedModel(file, scan.read(), scan)
 
 
@@ -133,7 +135,8 @@ def open_mjcf(checked: CheckedModel, *, compiled: bool = False) -> mujoco.MjSpec
         compiled: whether to check by compiling that MuJoCo accepts the model.
 
     Raises:
-        BadModel: if MuJoCo cannot read it.
+        BadModel: if MuJoCo cannot read or compile the model, or the model has an option with which it cannot run.
+        MachineError: if memory is too small.
     """
     file = checked.file
     try:
@@ -192,7 +195,7 @@ def _check_options(spec: mujoco.MjSpec, file: Path) -> None:
             raise BadModel(f"{file}: option {name} is not finite; give finite numbers")
     if np.abs(option.gravity).max() > _MAX_GRAVITY:
         found = " ".join(f"{value:g}" for value in option.gravity)
-        raise BadModel(f'{file}: option gravity="{found}" is too large; {_MAX_GRAVITY:,} m/s^2 is allowed')
+        raise BadModel(f'{file}: option gravity="{found}" is too large; at most {_MAX_GRAVITY:,} m/s^2 is allowed')
     widths = {mujoco.mjtJoint.mjJNT_FREE: 7, mujoco.mjtJoint.mjJNT_BALL: 4}
     positions = sum(widths.get(joint.type, 1) for joint in spec.joints)
     for key in spec.keys:
@@ -220,7 +223,8 @@ def _compile_in_subprocess(files: Sequence[Path]) -> None:
         return
     limits = f"{TIME_S} s of CPU time or {MAX_MEMORY >> 30} GiB of memory"
     why = done.stdout.strip() or (
-        f"{_named(files)}: compiling takes more than {limits}, or crashes (exit {done.returncode}); simplify it"
+        f"{_named(files)}: compiling takes more than {limits}, or crashes (exit code {done.returncode}); simplify the"
+        " model"
     )
     raise BadModel(shorten(" ".join(why.split()), 500))
 

@@ -1,6 +1,7 @@
-"""Lists of the MjData fields and sensors that MuJoCo computes in the last stage of a step: forces, accelerations.
+"""Lists of the MjData fields and sensors of forces and accelerations, which MuJoCo computes in a step's last stage.
 
-Steps compute some of them only if a sensor needs them, so terms that read them add a sensor.
+MuJoCo computes the forces on bodies and their accelerations only if a sensor needs them. If a term reads such a field,
+`add_body_forces` adds a sensor to the model.
 """
 
 from __future__ import annotations
@@ -31,12 +32,12 @@ def add_body_forces(spec: mujoco.MjSpec) -> None:
 
 
 def force_sensor_columns(model: mujoco.MjModel) -> list[int]:
-    """Return the columns of `sensordata` with readings of forces or accelerations (the acceleration stage)."""
+    """Return the columns of MjData's `sensordata` with readings of forces or accelerations (the acceleration stage)."""
     acceleration = int(mujoco.mjtStage.mjSTAGE_ACC)
     return sensor_columns(model, np.flatnonzero(model.sensor_needstage == acceleration).tolist())
 
 
 def sensor_columns(model: mujoco.MjModel, sensors: list[int]) -> list[int]:
-    """Return the columns of `sensordata` that belong to the sensors with the given ids."""
+    """Return the columns of MjData's `sensordata` that belong to the sensors with these ids, in their order."""
     starts, sizes = model.sensor_adr, model.sensor_dim
     return [column for s in sensors for column in range(int(starts[s]), int(starts[s] + sizes[s]))]

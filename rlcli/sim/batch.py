@@ -1,4 +1,4 @@
-"""CPU engine on `mujoco.batch.Batch`, a thread pool in C++ that steps many worlds (simulations).
+"""CPU engine on `mujoco.batch.Batch`, a thread pool in C++ that steps many worlds (simulations of environments).
 
 Results are bit-identical for any number of threads.
 """
@@ -44,8 +44,9 @@ class BatchEngine(BatchWorlds):
     Args:
         model: the compiled model.
         num_envs: number of worlds.
-        config: configuration of the simulation. With `external_forces`, `cfrc_ext` is computed exactly: Batch computes
-            it only for models with certain sensors, and with RK4 at the wrong stage of a substep.
+        config: configuration of the simulation. With `external_forces`, `cfrc_ext` (forces on bodies) is computed
+            exactly: Batch computes the field only for models with certain sensors, and with RK4 at the wrong stage of
+            a physics step.
 
     Raises:
         DeviceError: for more worlds than the machine's memory holds.
@@ -73,7 +74,7 @@ class BatchEngine(BatchWorlds):
             self.state_layout, self._rows, self._batch.warning, self._expanded, self._max_velocity
         )
         self._bound_inputs: list[NDArray[np.float64]] = []
-        """Names of state fields, except positions and velocities, that terms have requested and may write to."""
+        """Arrays of the state fields, except positions and velocities, that terms have requested and may write to."""
         self._substep_fields = config.derived_fields == "substep"
         self.step_stage = _NONE
         """Stage (mjtStage) up to which derived fields are computed after the last physics step of a call."""
@@ -99,7 +100,11 @@ class BatchEngine(BatchWorlds):
         """Do nothing: a CPU has no streams."""
 
     def field(self, name: str) -> Tensor:
-        """Return a live view of an MjData field. A derived field (xpos, ...) is computed by every later `step`."""
+        """Return a live view of an MjData field, (num_envs, ...); later steps compute a derived field (xpos, ...).
+
+        Raises:
+            ValueError: if MjData has no such field.
+        """
         if name not in self._fields:
             if name not in DATA_FIELDS:
                 hint = did_you_mean(name, DATA_FIELDS) or "see mujoco/mjdata.h"
@@ -157,11 +162,11 @@ class BatchEngine(BatchWorlds):
             forces[world] = self._data.cfrc_ext
 
     def diverged(self, motion_is_finite: bool = False) -> Tensor | None:
-        """Return the worlds that diverged since the last call, (num_envs,) bool; None if there are none.
+        """Return whether each world diverged since the last call, (num_envs,) bool; None if no world diverged.
 
-        `described_divergences` then has the first of them. MuJoCo itself resets a diverging world to finite values, so
-        the state does not show the divergence. MuJoCo's warning counters show it; they are read and cleared after every
-        step. A divergence without a warning leaves a state that is not finite: the sum of all states is not finite.
+        `described_divergences` then has the first divergences. MuJoCo itself resets a diverging world to finite values,
+        so the state does not show the divergence. MuJoCo's warning counters show it; they are read and cleared by every
+        call. A divergence without a warning leaves a state that is not finite: the sum of all states is not finite.
 
         This sum takes longer than all other checks. If physics changes only positions and velocities, and the caller
         has checked these (`motion_is_finite`), only the inputs that terms may have written to are summed.
@@ -184,9 +189,9 @@ class BatchEngine(BatchWorlds):
         return torch.from_numpy(bad)
 
     def _find_diverged(self, finite: bool) -> tuple[NDArray[np.bool_], NDArray[np.object_]]:
-        """Return (which worlds diverged, the cause of each), and clear the warning counters.
+        """Return whether each world diverged, and the cause (empty if it did not); clear the warning counters.
 
-        `finite` says that the state of every world is known to be finite.
+        `finite` is true if the state of every world is known to be finite.
         """
         counts = self._batch.warning[:, :, 1]
         for name, kind in report.OTHER_WARNINGS.items():
@@ -248,7 +253,7 @@ class BatchEngine(BatchWorlds):
         return tensor.numpy()
 
     def select(self, mask: Field, seed: int, counters: Field) -> IdSelection | None:
-        """Return a selection of the worlds where `mask` is true, None if there is none; see `Engine.select`."""
+        """Return a selection of the worlds where `mask` is true, None if there are none; see `Engine.select`."""
         ids = np.asarray(mask).nonzero()[0]
         if not len(ids):
             return None
@@ -273,10 +278,10 @@ class BatchEngine(BatchWorlds):
         return []
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return copies of the worlds' state.
+        """Return copies of the worlds' state, by name.
 
-        They include the forces and accelerations of the last substep that have been requested with `field`: MuJoCo's
-        mj_forward cannot compute them from the state.
+        The state includes the fields of forces and accelerations that have been requested with `field`, because
+        MuJoCo's mj_forward cannot compute the values of the last physics step from the other fields.
         """
         substep = {f"substep.{name}": value.clone() for name, value in self._fields.items() if self._of_substep(name)}
         return {**super().state_dict(), **substep}
@@ -309,7 +314,7 @@ class BatchEngine(BatchWorlds):
             self._fields[name].copy_(value)
 
     def _only_of_acceleration_stage(self, name: str) -> bool:
-        """Return whether MuJoCo computes the whole field in the acceleration stage; `sensordata`: all its sensors."""
+        """Return whether MuJoCo computes all values of a field in the acceleration stage of a step."""
         if name == "sensordata":
             return len(self._force_sensors) == int(self.model.nsensordata)
         return name in ACCELERATION_FIELDS

@@ -1,6 +1,6 @@
-"""Base class of the CPU engine that holds its worlds (one per environment) and their states.
+"""Base class of the CPU engine that holds its worlds (one for each environment) and their states.
 
-It also gives worlds their own values of model fields, for domain randomization.
+For domain randomization, the class also gives each world its own values of model fields.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ _FLAGS = {
     *("jnt_actfrclimited", "tendon_limited", "tendon_actfrclimited", "actuator_ctrllimited", "actuator_actlimited"),
     *("actuator_forcelimited", "eq_active0", "opt.disableactuator"),
 }
-"""Integer fields of a model that are flags: no value of them can make MuJoCo read outside of its arrays."""
+"""Integer fields of a model that are flags: unlike an index, a flag cannot make MuJoCo read outside of its arrays."""
 _MIN_STATES_PER_ENV = 3
-"""Lower bound of an environment's memory, in multiples of its integration state; built-in tasks need 3.3 to 16."""
+"""Lower bound of an environment's memory, in sizes of its integration state; built-in tasks need 3.3 to 16 sizes."""
 
 
 class BatchWorlds:
@@ -82,7 +82,11 @@ class BatchWorlds:
         return name in MODEL_FIELDS
 
     def expand(self, name: str) -> Tensor:
-        """Give every world its own values of a model field; return a writable view of the values. (num_envs, ...)"""
+        """Give every world its own values of a model field; return a writable view of the values. (num_envs, ...)
+
+        Raises:
+            ValueError: if the field cannot differ between worlds.
+        """
         if name not in MODEL_FIELDS:
             hint = did_you_mean(name, MODEL_FIELDS) or f"fields that can: {listing(sorted(MODEL_FIELDS))}"
             raise ValueError(f"model field '{name}' cannot differ between environments; {hint}")
@@ -93,7 +97,7 @@ class BatchWorlds:
         return values
 
     def expanded(self, name: str) -> Tensor | None:
-        """Return a model field for which each world has its own values; None if all worlds share the model's."""
+        """Return a model field for which each world has its own values, (num_envs, ...); None if all share a value."""
         return self.expand(name) if name in self._expanded else None
 
     def expanded_fields(self) -> list[str]:
@@ -101,7 +105,10 @@ class BatchWorlds:
         return list(self._expanded)
 
     def set_constants(self, selection: Selection | None = None) -> None:
-        """Recompute the constants that MuJoCo derives from model fields such as masses (mj_setConst)."""
+        """Recompute the constants that MuJoCo derives from model fields such as masses (mj_setConst).
+
+        `selection` are the worlds; None: all.
+        """
         with engine_call():
             self._batch.set_const(None if selection is None else ids_of(selection).astype(np.int32))
         self.own_constants = True
@@ -119,7 +126,8 @@ class BatchWorlds:
         target = self.expand(name)
         require_matching_tensors({name: values}, {name: target}, "model field")
         if not target.dtype.is_floating_point and name not in _FLAGS and not torch.equal(target, values):
-            raise ValueError(f"model field '{name}' differs from the saved one; restore the MJCF of the saved state")
+            message = f"model field '{name}' differs from the saved values"
+            raise ValueError(f"{message}; restore the MJCF with which the state was saved")
         target.copy_(values)
 
     def write_own_model(self, env: int, model: mujoco.MjModel) -> None:
@@ -161,12 +169,12 @@ class BatchWorlds:
                 field[env] = torch.from_numpy(np.array(getattr(data, name))).reshape(field[env].shape)
 
     def set_default_state(self, qpos: Tensor, qvel: Tensor) -> None:
-        """Set the joint state that `reset` restores."""
+        """Set the positions and velocities that `reset` restores. (nq,), (nv,)"""
         for name, values in (("qpos", qpos), ("qvel", qvel)):
             self._default[self.state_layout.columns(name)] = values.numpy()
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return copies of the state rows, the warning counters and the model fields with a value for each world."""
+        """Return copies of the states, the warning counters and the model fields that differ between worlds."""
         return {
             "state": self._state.clone(),
             "warning": torch.from_numpy(np.array(self._batch.warning)),
@@ -211,7 +219,7 @@ class BatchWorlds:
         self.history = StateHistory(self._rows, width, self._default, calls, memory=memory, count=count)
 
     def _skip_nothing(self) -> None:
-        """Compute everything from now on: set the disable flags back to those of the original model."""
+        """Let MuJoCo compute everything from now on: set the disable flags back to those of the original model."""
         if self._skipped:
             self._skipped = 0
             expand_disable_flags(self._batch)[:] = self._disable_flags
@@ -219,10 +227,10 @@ class BatchWorlds:
 
 @contextlib.contextmanager
 def engine_call() -> Iterator[None]:
-    """Turn MuJoCo's profiler off in the `with` block, and convert errors of `mujoco.batch`.
+    """Turn MuJoCo's profiler off in the `with` block, and convert errors of `mujoco.batch` to errors of rlcli.
 
     Raises:
-        DivergedError: for an error of `mujoco.batch`.
+        DivergedError: if `mujoco.batch` raises an error.
     """
     try:
         with without_profiler:

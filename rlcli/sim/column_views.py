@@ -1,4 +1,4 @@
-"""Conversion of column positions (such as those of some joints) to an index into a tensor.
+"""Convert the positions of columns (such as those of some joints) to an index into a tensor, and cache views.
 
 The index is a slice where possible, because indexing with a slice gives a view instead of a copy.
 """
@@ -39,7 +39,7 @@ def evenly_spaced(positions: Sequence[int], device: torch.device | None = None) 
 
 @functools.lru_cache(maxsize=4096)
 def _consecutive(first: int, stop: int) -> slice:
-    """Return a slice, the same object for the same columns: terms then share a view, which `CachedViews` caches."""
+    """Return a slice, the same object for equal arguments: `CachedViews` caches one view for each slice object."""
     return slice(first, stop)
 
 

@@ -1,6 +1,6 @@
-"""Estimate of the largest numbers of contacts and constraints in a world.
+"""Estimate the largest numbers of contacts and constraints in a world, the simulation of one environment.
 
-MuJoCo Warp, the GPU engine, allocates memory for them in advance.
+MuJoCo Warp, on which the GPU engine is built, allocates memory for contacts and constraints in advance.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def required_capacity(model: mujoco.MjModel, contacts: int | None = None, constr
 
 
 def _upper_bound(model: mujoco.MjModel) -> tuple[int, int]:
-    """Return upper bounds of (contacts, constraint rows) in a world."""
+    """Return upper bounds of the numbers of (contacts, constraint rows) in a world."""
     contacts = rows = 0
     for a, b in colliding_pairs(model):
         kinds = tuple(sorted((_G(model.geom_type[a]), _G(model.geom_type[b])), key=int))
@@ -84,7 +84,7 @@ def _contact_rows(model: mujoco.MjModel, condim: int) -> int:
 
 
 def _sampled_maximum(model: mujoco.MjModel) -> tuple[int, int]:
-    """Return the largest (contacts, constraint rows) in short simulations with random velocities and controls.
+    """Return the largest numbers of (contacts, constraint rows) in short simulations with random motion and controls.
 
     Half of the simulations begin with random joint positions, half of them at a random point of a height field.
     """
@@ -112,7 +112,7 @@ def _move_joints(model: mujoco.MjModel, data: mujoco.MjData, rng: np.random.Gene
 
 
 def _move_on_height_field(model: mujoco.MjModel, data: mujoco.MjData, rng: np.random.Generator) -> None:
-    """Move free roots to a random point of a height field: an environment may start anywhere on it."""
+    """Move all bodies with a free joint to a random point of the first height field; without one do nothing."""
     fields = np.flatnonzero(model.geom_type == int(_G.mjGEOM_HFIELD))
     if not len(fields):
         return

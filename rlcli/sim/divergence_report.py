@@ -1,6 +1,6 @@
-"""Description of diverged simulations: the cause, and the recorded engine calls before the divergence.
+"""Describe diverged simulations: the cause of the divergence, and the recorded engine calls before it.
 
-The engines create the descriptions; logs and crash dumps show them.
+Logs and crash dumps show the descriptions. The columns of the integration state (`StateLayout`) are here, too.
 """
 
 from __future__ import annotations
@@ -28,21 +28,24 @@ MORE_MEMORY = "if the contact arena is full, set a larger <size memory=...> in t
 WARNING_FIELDS = {"BADCTRL": "ctrl", "BADQPOS": "qpos", "BADQVEL": "qvel", "BADQACC": "qacc"}
 """MuJoCo warning that means divergence -> MjData field to which the index stored with the warning belongs."""
 DIVERGENCE_WARNINGS = {name: int(getattr(mujoco.mjtWarning, f"mjWARN_{name}")) for name in WARNING_FIELDS}
-"""Warnings after which MuJoCo resets a world or ignores its controls; the first of several is the cause."""
+"""Warnings after which MuJoCo resets a world or ignores its controls: name -> index (mjtWarning).
+
+If a world has several warnings, the first one in this order is the cause.
+"""
 OTHER_WARNINGS = {
     "contact_full": int(mujoco.mjtWarning.mjWARN_CONTACTFULL),
     "constraint_full": int(mujoco.mjtWarning.mjWARN_CNSTRFULL),
     "inertia": int(mujoco.mjtWarning.mjWARN_INERTIA),
 }
-"""Warnings that are counted and that are no divergence."""
+"""Warnings of MuJoCo that are counted, but do not mean divergence: name -> index (mjtWarning)."""
 _INPUTS_FIRST = (
     *("mocap_pos", "mocap_quat", "ctrl", "xfrc_applied", "qfrc_applied", "act", "eq_active", "userdata", "history"),
     *("plugin_state", "plastic", "qpos", "qvel", "qacc_warmstart", "time"),
 )
-"""Fields of the integration state, inputs first: the first one that is not finite is the likely cause of others."""
+"""Fields of the integration state, inputs first: the first field that is not finite is the likely cause of others."""
 
 States = NDArray[np.float64]
-"""Integration states, one row for each environment, or the state of one environment."""
+"""Integration states (mjSTATE_INTEGRATION): a row for each environment, or the state of one environment."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +57,10 @@ class Divergence:
     cause: str
     """MuJoCo's warning without its prefix (`BADQACC`), `FIELD not finite`, `FIELD out of bounds`, or `engine error`."""
     detail: str = ""
-    """Element of the model (such as a joint) where the divergence was found and its cause, or the engine's error."""
+    """Element of the model (such as a joint) with the bad value, and a field that was not finite before.
+
+    For the cause `engine error`, the error message of the engine.
+    """
     index: int = -1
     """Index of the bad value in the field of the warning or in `qvel`; -1 if unknown."""
 
@@ -74,9 +80,9 @@ class Call:
 
 
 class StateHistory:
-    """Ring buffer of the states before the last calls of `Engine.step`, from which replays start.
+    """Ring buffer of the states of all environments before the last calls of `Engine.step`, from which replays start.
 
-    Only the first `width` columns are recorded; in the others every state equals `default`.
+    Only the first `width` columns of the states are recorded; in the other columns every state equals `default`.
 
     Args:
         state: the engine's integration states, a live view. (n, nstate)
@@ -97,7 +103,7 @@ class StateHistory:
         self.memory = memory
         self.requested_calls = calls
         self.calls = max(1, min(calls, memory // max(1, self._source.nbytes)))
-        """Length of the ring buffer."""
+        """Length of the ring buffer, in calls."""
         self._ring = np.empty((self.calls, *self._source.shape))
         self._nstep = [0] * self.calls
         self.count = self._oldest = count
@@ -105,7 +111,7 @@ class StateHistory:
         self._episode_start = np.full(len(state), count, dtype=np.int64)
 
     def record(self, nstep: int) -> None:
-        """Record the states before a call of `nstep` physics steps."""
+        """Record the present states; the engine calls this before a call of `nstep` physics steps."""
         slot = self.count % self.calls
         self._ring[slot] = self._source
         self._nstep[slot] = nstep
@@ -131,7 +137,7 @@ class StateHistory:
         return self.calls_between(env, int(self._episode_start[env]), self.count)
 
     def calls_between(self, env: int, first: int, stop: int) -> list[Call]:
-        """Return the calls with the numbers `first` to `stop` - 1 of an environment that are still in the buffer."""
+        """Return the calls of an environment with the numbers `first` to `stop` - 1, as far as the buffer has them."""
         first = max(first, self._oldest, self.count - self.calls)
         numbers = range(first, min(stop, self.count))
         return [Call(self._state_before(env, number), self._nstep[number % self.calls]) for number in numbers]
@@ -164,7 +170,7 @@ class StateLayout:
         return list(self._columns.items())
 
     def nonfinite_fields(self, state: States) -> list[str]:
-        """Return the names of the fields of a state that are not finite, inputs of the simulation first."""
+        """Return the names of the fields of a state (nstate,) that are not finite, inputs of the simulation first."""
         names = [name for name in _INPUTS_FIRST if name in self._columns]
         return [name for name in names if not np.isfinite(state[self._columns[name]]).all()]
 
@@ -183,7 +189,7 @@ class StateLayout:
 
 @dataclass(frozen=True, slots=True)
 class DivergenceReporter:
-    """Reporter of the causes of diverged worlds of the CPU engine.
+    """Finder of the causes of divergences in the worlds of the CPU engine.
 
     Args:
         layout: columns of the integration state.
@@ -200,17 +206,17 @@ class DivergenceReporter:
     max_velocity: float
 
     def nonfinite_field(self, env: int) -> str:
-        """Return the name of the first field of a world that is not finite, of its model or of its state."""
+        """Return the name of the first field that is not finite, of a world's model fields or else of its state."""
         return [*self._nonfinite_model_fields(env), *self.layout.nonfinite_fields(self.states[env])][0]
 
     def describe(self, env: int, cause: str, before: States, error: str) -> Divergence:
-        """Describe the divergence of a world.
+        """Return the description of a world's divergence.
 
         Args:
             env: index of the world.
             cause: cause of the divergence.
             before: state of the world before the step. (nstate,)
-            error: error message of the engine.
+            error: error message of the engine; used if the cause is `ENGINE_ERROR`.
         """
         if cause == ENGINE_ERROR:
             return Divergence(env, cause, f"{error}; {MORE_MEMORY}")

@@ -1,4 +1,4 @@
-"""Protocol of physics engines, which step many worlds (simulations) of one model, one for each environment.
+"""Interface `Engine` of physics engines, which step many worlds of one model: a simulation for each environment.
 
 `open_engine` returns the engine for a device: on a CPU or on a GPU.
 """
@@ -36,9 +36,9 @@ class EngineView(Protocol):
     shared_streams: int
     """Worlds i and i % shared_streams draw the same random numbers; 0: every world has its own stream."""
     asynchronous: bool
-    """Whether the engine computes on a GPU, so that reading a value in Python forces a host sync: not in a step."""
+    """Whether the engine computes on a GPU, so that code in a step must not read a value in Python (a host sync)."""
     forces_after_reset: bool
-    """Whether `forward` computes fields of the acceleration stage; if not, `reset` sets them to 0."""
+    """Whether `forward` computes forces and accelerations (the acceleration stage); if not, `reset` sets them to 0."""
 
     @property
     def replayable(self) -> ReplayableView | None:
@@ -46,7 +46,7 @@ class EngineView(Protocol):
 
     @property
     def warnings(self) -> dict[str, int]:
-        """Number of MuJoCo's warnings that are no divergence, by name."""
+        """Number of MuJoCo's warnings that do not mean divergence, by name."""
 
     @property
     def divergence_causes(self) -> dict[str, int]:
@@ -56,8 +56,11 @@ class EngineView(Protocol):
         """Return a live view of an MjData field: state fields are writable, derived ones (xpos, ...) are not.
 
         Fields that depend on positions and velocities are current after `step` and `forward`. Fields that depend on
-        accelerations (qacc, actuator_force, ...) have the values of the last substep. With
-        `sim.derived_fields: substep` all derived fields have the values of the last substep.
+        accelerations (qacc, actuator_force, ...) have the values of the last physics step (substep). With
+        `sim.derived_fields: substep` all derived fields have the values of the last physics step.
+
+        Raises:
+            ValueError: if there is no such field.
         """
 
     def expanded_fields(self) -> list[str]:
@@ -79,7 +82,7 @@ class ReplayableView(EngineView, Protocol):
 
     @property
     def history(self) -> StateHistory:
-        """States before the last calls of `step`."""
+        """Record of the states before the last calls of `step`."""
 
     def record_calls(self, calls: int, memory: int = HISTORY_MEMORY) -> None:
         """Record the states before the last `calls` calls of `step`; fewer calls if `memory` bytes are too little."""
@@ -106,10 +109,10 @@ class Engine(EngineView, Protocol):
 
     @property
     def described_divergences(self) -> list[Divergence]:
-        """First divergences that the last call of `diverged` found; on a GPU, the first one since the start."""
+        """First divergences that the last call of `diverged` found; on a GPU, the first divergence since the start."""
 
     def use_torch_stream(self) -> None:
-        """Launch GPU kernels on torch's current CUDA stream from now on; called before a step."""
+        """Launch GPU kernels on torch's current CUDA stream from now on; environments call this before each step."""
 
     def can_expand(self, name: str) -> bool:
         """Return whether a model field may differ between worlds."""
@@ -118,10 +121,13 @@ class Engine(EngineView, Protocol):
         """Give every world its own values of a model field; return a writable view of the values. (num_envs, ...)
 
         After a write to masses, inertias, positions and the like, call `set_constants`.
+
+        Raises:
+            ValueError: if the field cannot differ between worlds.
         """
 
     def expanded(self, name: str) -> Tensor | None:
-        """Return a model field for which each world has its own values; None if all worlds share the model's."""
+        """Return a model field for which each world has its own values, (num_envs, ...); None if all share a value."""
 
     def set_constants(self, selection: Selection | None = None) -> None:
         """Recompute the constants that MuJoCo derives from model fields, after a write to expanded fields.
@@ -134,9 +140,9 @@ class Engine(EngineView, Protocol):
         """Advance every world by `nstep` physics steps; then, with `derive`, update derived fields such as xpos."""
 
     def diverged(self, motion_is_finite: bool = False) -> Tensor | None:
-        """Return the worlds that diverged in the last `step`, (num_envs,) bool, or None. Call it once per step.
+        """Return whether each world diverged in the last `step`, (num_envs,) bool; None if no world did.
 
-        A GPU engine has already restored the state that these worlds had before the step.
+        Call this once per step. A GPU engine has already restored the state that these worlds had before the step.
 
         Args:
             motion_is_finite: whether the caller has checked that all positions and velocities are finite.
@@ -180,16 +186,17 @@ class Engine(EngineView, Protocol):
         """
 
     def check_finite(self, values: Tensor, what: str) -> None:
-        """Start a check that values are finite, without a host sync; `report_nonfinite` returns the result.
+        """Start a check that values are finite, on a GPU without a host sync; `report_nonfinite` returns the result.
 
-        `what` is the name of the values for messages.
+        `what` is the name of the values for messages. A CPU engine does nothing: there, values are checked when they
+        are computed.
         """
 
     def report_nonfinite(self) -> list[str]:
         """Return the names of the values for which `check_finite` failed since the last call."""
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return copies of the worlds' state."""
+        """Return copies of the worlds' state, by name."""
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
         """Restore the state returned by `state_dict()`."""
@@ -223,16 +230,22 @@ class ReplayableEngine(Engine, ReplayableView, Protocol):
     def write_own_model(self, env: int, model: mujoco.MjModel) -> None:
         """Write one world's values of all model fields into `model`, a copy of the engine's model.
 
-        The disable flags of `model` stay those of the engine's model.
+        The disable flags of `model` stay as in the engine's model, unless they differ between worlds.
         """
 
 
 def open_engine(model: mujoco.MjModel, num_envs: int, config: SimConfig, *, device: str = "cpu") -> Engine:
-    """Open the engine for a device.
+    """Return the engine for a device: `sim.engine` of the configuration, by default `batch` on a CPU, `warp` on a GPU.
+
+    Args:
+        model: the compiled model.
+        num_envs: number of worlds, one for each environment.
+        config: configuration of the simulation.
+        device: cpu, cuda or cuda:N.
 
     Raises:
-        DependencyError: if the GPU engine is not installed.
-        ConfigError: for a model that the engine cannot run.
+        DependencyError: if MuJoCo Warp, which the GPU engine needs, is not installed.
+        ConfigError: for a model that the engine cannot run, or an engine that does not run on the device.
         DeviceError: if the device is missing, or its memory does not hold all worlds.
     """
     on_cpu = device.partition(":")[0] == "cpu"
@@ -252,7 +265,7 @@ def open_engine(model: mujoco.MjModel, num_envs: int, config: SimConfig, *, devi
 
 
 def open_cpu_engine(model: mujoco.MjModel, num_envs: int, config: SimConfig) -> ReplayableEngine:
-    """Open the CPU engine.
+    """Return the CPU engine.
 
     Raises:
         DeviceError: for more worlds than the machine's memory holds.

@@ -1,7 +1,7 @@
-"""Selections of environments for resets and events, with random numbers, and reads and writes of their rows.
+"""Selections of environments, such as those to reset: read and set their rows of tensors, and draw random numbers.
 
-On a CPU a selection is a short list of ids. In a CUDA graph it must be a mask over all environments. A term that uses
-only the methods of `Selection` runs on both.
+On a CPU a selection is a short list of ids. On a GPU it is a mask over all environments, because a CUDA graph has fixed
+sizes. A term that uses only the methods of `Selection` runs on both.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from torch import Tensor
 from rlcli import random
 
 Columns: TypeAlias = slice | Tensor
-"""Index of some columns."""
+"""Index of some columns of a tensor: a slice, or a tensor of positions (int64)."""
 Field: TypeAlias = Any
 """A (num_envs, ...) tensor, or `Engine.as_field` of this tensor, which is faster to read and write. A term that reads
 the tensor in every step calls `as_field` once, because the call takes as long as reading a few rows."""
@@ -44,7 +44,7 @@ def one_column(columns: Columns, count: int, parameter: str) -> int:
     """Return the single column that an index into `count` columns selects; `parameter` is its name in the message.
 
     Raises:
-        ValueError: if the index selects no column, or several.
+        ValueError: if the index selects no column or several columns.
     """
     found = torch.arange(count)[columns if isinstance(columns, slice) else columns.cpu()].tolist()
     if len(found) != 1:
@@ -79,28 +79,34 @@ class Selection(Protocol):
         """Return a copy of the selected environments' rows of a (num_envs, ...) tensor."""
 
     def read_view(self, field: Field, columns: Columns = ALL) -> Tensor:
-        """Return the selected rows, if possible as a view: do not write to it, and do not use it after a write."""
+        """Return the selected rows of a (num_envs, ...) tensor, if possible as a view.
+
+        Do not write to the result, and do not use it after a write to the tensor.
+        """
 
     def write(self, field: Field, values: Tensor | float, columns: Columns = ALL) -> None:
-        """Set the selected environments' rows of a (num_envs, ...) tensor."""
+        """Set the selected environments' rows of a (num_envs, ...) tensor; `values` has one row for each of them."""
 
     def add(self, field: Field, values: Tensor | float, columns: Columns = ALL) -> None:
-        """Add to the selected environments' rows of a (num_envs, ...) tensor."""
+        """Add to the selected environments' rows of a (num_envs, ...) tensor; `values` has one row for each of them."""
 
     def mean(self, values: Tensor) -> Tensor:
         """Return the mean of a (num_envs,) tensor over the selected environments. (scalar)"""
 
     def where(self, mask: Field) -> Selection | None:
-        """Return a selection of the rows where `mask` (num_envs,) is true; None if it is known to be empty."""
+        """Return a selection of the selected environments where `mask` (num_envs,) is true.
+
+        Return None if the result is known to be empty; on a GPU this is not known, and None is never returned.
+        """
 
     def union(self, other: Any) -> Selection:
-        """Return a selection of the rows of this selection and of another one of the same engine."""
+        """Return a selection of the environments of this selection and of another selection of the same engine."""
 
     def env_ids(self) -> Tensor:
         """Return the indices of the environments; on a GPU this forces a host sync. (rows,) int64"""
 
     def stream(self, stream: np.uint64) -> Selection:
-        """Return a selection of the same rows with another random stream, a result of `rlcli.random.stream`."""
+        """Return a selection of the same environments with another random stream, a result of `rlcli.random.stream`."""
 
 
 def _as_array(values: Any) -> Any:
@@ -209,7 +215,10 @@ class IdSelection:
         return self._with(self.ids[chosen], self.counters[chosen], self.stream_key)
 
     def union(self, other: IdSelection) -> IdSelection:
-        """Return a selection of the rows of this selection or of `other`; common rows keep the counters of this one."""
+        """Return a selection of the environments of this selection and of `other`.
+
+        Environments of both keep the counters of this selection.
+        """
         ids, first = np.unique(np.concatenate([self.ids, other.ids]), return_index=True)
         counters = np.concatenate([self.counters, other.counters])[first]
         return self._with(ids, counters, self.stream_key)

@@ -1,6 +1,7 @@
-"""Opening of an OpenGL context for rendering; the OpenGL library is chosen when the first image is rendered.
+"""Open an OpenGL context for rendering, with the first OpenGL library (backend) that works.
 
-If MUJOCO_GL is not set: the OpenGL of the display if there is a display, else EGL, else OSMesa.
+The environment variable MUJOCO_GL chooses the backend. If it is not set, these are tried: GLFW if there is a display,
+then EGL, then OSMesa.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ _ADDRESS_SPACE = 2 << 30
 def opengl_import_error(error: BaseException) -> MachineError | None:
     """Return an error with a hint if `error`, from importing MuJoCo, is due to MUJOCO_GL; None for any other error.
 
-    When MuJoCo is imported, it loads the OpenGL library that MUJOCO_GL names, even if nothing is rendered.
+    MuJoCo loads the OpenGL library that MUJOCO_GL names when MuJoCo is imported, even if nothing is rendered.
     """
     chosen = os.environ.get("MUJOCO_GL", "").strip()
     raised_in = [frame.filename for frame in traceback.extract_tb(error.__traceback__) if frame.name == "<module>"]
@@ -33,12 +34,12 @@ def opengl_import_error(error: BaseException) -> MachineError | None:
     reason, advice = "MuJoCo has no such OpenGL backend", "use egl, osmesa, glfw or disable"
     if backend in _PACKAGES:
         reason, advice = f"its library cannot be loaded ({one_line(error, 100)})", f"install {_PACKAGES[backend]}"
-    hint = f"{advice}, or unset MUJOCO_GL: rlcli then chooses one that works"
+    hint = f"{advice}, or unset MUJOCO_GL: rlcli then chooses a backend that works"
     return MachineError(f"MUJOCO_GL={chosen}: {reason}", hint=hint)
 
 
 def has_display() -> bool:
-    """Return whether there is a display for windows."""
+    """Return whether windows can be opened: on Linux, whether DISPLAY or WAYLAND_DISPLAY is set; elsewhere True."""
     if sys.platform.startswith("linux"):
         return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
     return True
@@ -86,7 +87,7 @@ def _has_window() -> bool:
 
 
 def candidates() -> list[str]:
-    """Return the OpenGL backends to try, the best one first.
+    """Return the names of the OpenGL backends to try, in this order.
 
     Raises:
         MachineError: if MUJOCO_GL disables rendering.

@@ -1,6 +1,6 @@
 """Class `MaskSelection`: a subset of the environments as a mask, for the GPU engine.
 
-Unlike a list of indices, a mask needs no host sync (the CPU does not wait for the GPU).
+A mask needs no host sync: a list of indices would, because the CPU must know its length.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ class MaskSelection:
         return self.mask.nonzero()[:, 0]
 
     def union(self, other: MaskSelection) -> MaskSelection:
-        """Return a selection of the rows of this selection and of another one."""
+        """Return a selection of the environments of this selection and of another selection."""
         return MaskSelection(self.mask | other.mask, self.seed, self.counters, shared_streams=self.shared_streams)
 
     def stream(self, stream: np.uint64) -> MaskSelection:

@@ -1,7 +1,8 @@
-"""Arrows, spheres and frames that viewers show in every environment; they are not part of the physics.
+"""Markers: arrows, spheres and frames that viewers show in every environment, and that are not part of the physics.
 
-The method `markers()` of a command term returns markers. It is called when a viewer renders, never in a step. Positions
-are in the same frame as `entity.data.root_pos_w`, one row per environment; a position that is not finite is not shown.
+The method `markers()` of a command term returns markers; viewers call the method when they render. Positions are in the
+world frame, like `entity.data.root_pos_w`, one row for each environment; a marker whose position is not finite is not
+shown.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ ACTUAL: Color = (0.1, 0.3, 1.0, 1.0)
 
 
 class Arrow(NamedTuple):
-    """Arrow, which is not shown if its length is at most its radius."""
+    """Arrow, such as a commanded velocity; it is not shown if its length is at most its radius."""
 
     start: Tensor
     """Start point of the arrow. (num_envs, 3) [m]"""

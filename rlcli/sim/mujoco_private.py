@@ -1,6 +1,6 @@
-"""Private names of MuJoCo that rlcli uses: those of `mujoco.batch`, and the clock variable of MuJoCo's C library.
+"""Functions that use private names of MuJoCo: of `mujoco.batch`, and the clock variable of MuJoCo's C library.
 
-A new version of MuJoCo may rename any of them, so they are used only in this module.
+A new version of MuJoCo may rename private names, so no other module uses them.
 """
 
 from __future__ import annotations
@@ -48,17 +48,17 @@ STATE_FIELDS: dict[str, mujoco.mjtState] = _private(mujoco.batch, "_STATE_FIELDS
 def make_batch(
     model: mujoco.MjModel, num_envs: int, threads: int, *, disable_flags: int = 0, persistent: bool = False
 ) -> Batch:
-    """Make a `mujoco.batch.Batch`, which steps many worlds of a model in threads.
+    """Return a `mujoco.batch.Batch`, which steps many worlds of a model in threads.
 
     Args:
         model: the compiled model; it is copied, because other threads may step it.
         num_envs: number of worlds.
-        threads: number of threads that step them.
+        threads: number of threads that step the worlds.
         disable_flags: disable flags (mjtDisableBit) to set in addition to those of the model.
         persistent: whether each world has its own MjData.
 
     Raises:
-        DependencyError: if the installed version of MuJoCo lacks a private name that is used here.
+        DependencyError: if the installed version of MuJoCo does not have a private name that this module uses.
     """
     own = copy.copy(model)
     own.opt.disableflags |= disable_flags
@@ -80,7 +80,7 @@ def expanded_fields(batch: Batch) -> dict[str, NDArray[Any]]:
 
 
 def expand_disable_flags(batch: Batch) -> NDArray[np.int32]:
-    """Give each world its own disable flags; return a live view of them. (num_envs,)
+    """Give each world its own disable flags (mjtDisableBit); return a live view of the flags. (num_envs,)
 
     The flags have no entry in `expanded_fields`.
     """
@@ -89,7 +89,10 @@ def expand_disable_flags(batch: Batch) -> NDArray[np.int32]:
 
 
 def forward_of(batch: Batch) -> Callable[[NDArray[np.int64], int], None]:
-    """Return `batch.forward` without its checks of the ids, which take longer than the computation for few worlds."""
+    """Return the function forward(ids of worlds, stage), which computes derived fields.
+
+    It is `batch.forward` without the checks of ids, which take longer than the computation for few worlds.
+    """
     compute, check = batch._b.forward, batch._check
 
     def forward(ids: NDArray[np.int64], stage: int) -> None:

@@ -1,7 +1,4 @@
-"""Function that turns off MuJoCo's log file and its warnings on the terminal.
-
-The engines read MuJoCo's warning counters instead.
-"""
+"""Turn off MuJoCo's log file and its warnings on the terminal."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ def rotate_inverse(quat: Tensor, vector: Tensor) -> Tensor:
 
 
 def multiply(left: Tensor, right: Tensor) -> Tensor:
-    """Return the Hamilton product: the rotation `right`, then `left`. (..., 4), (..., 4) -> (..., 4)"""
+    """Return the Hamilton product: the rotation `right` followed by `left`. (..., 4), (..., 4) -> (..., 4)"""
     w1, x1, y1, z1 = left.unbind(-1)
     w2, x2, y2, z2 = right.unbind(-1)
     return torch.stack(
@@ -75,7 +75,7 @@ def axis_z(quat: Tensor) -> Tensor:
 
 
 def axes(quat: Tensor) -> Tensor:
-    """Return `axis_x`, `axis_y` and `axis_z` in one tensor, in a third of the time of three calls. (n, 4) -> (n, 9)"""
+    """Return the columns of `axis_x`, `axis_y` and `axis_z` in one tensor, in a third of the time. (n, 4) -> (n, 9)"""
     factors, scales, offsets = _axis_tables(quat.device)
     left, right = quat.mT.contiguous().index_select(0, factors).chunk(2)
     first, second = (left * right).mul_(scales).chunk(2)
@@ -118,7 +118,7 @@ def turn_between(left: Tensor, right: Tensor) -> Tensor:
 
 
 def length(vector: Tensor) -> Tensor:
-    """Return the Euclidean length. (..., k) -> (...)"""
+    """Return the Euclidean length of a vector. (..., k) -> (...)"""
     return vector.square().sum(dim=-1).sqrt_()
 
 

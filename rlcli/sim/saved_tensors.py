@@ -1,6 +1,6 @@
-"""Base class for objects whose state is saved as named tensors, and checks of saved tensors before their use.
+"""Base class of objects whose state is saved as named tensors in checkpoints, and checks of saved tensors.
 
-Managers, sensors and engines save their state in checkpoints with it.
+Managers, terms with a state and sensors derive from the base class.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ class TensorState:
     """Base class of objects whose state consists of tensors, which are restored in place."""
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return the tensors themselves, by their keys in `state_dict`."""
+        """Return the tensors themselves, not copies, by their names in a checkpoint."""
         raise NotImplementedError
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return copies of the tensors."""
+        """Return copies of the tensors, by name."""
         return {name: tensor.clone() for name, tensor in self.tensors().items()}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
@@ -35,7 +35,7 @@ def mean_of(values: Tensor) -> Tensor:
 
 
 def means(values: Mapping[str, Tensor]) -> dict[str, float]:
-    """Return the mean of each tensor as a float, by the same names."""
+    """Return the mean of the values of each tensor as a float, by the same names."""
     return {name: float(mean_of(value)) if value.dim() else float(value) for name, value in values.items()}
 
 
@@ -53,7 +53,7 @@ def require_matching_tensors(saved: Mapping[str, Tensor], own: Mapping[str, Tens
         what: the part of the file, for the message.
 
     Raises:
-        ValueError: with the name of the first tensor that differs.
+        ValueError: if a shape or type differs; the message names the first such tensor.
     """
     for name, value in own.items():
         found = saved.get(name)
@@ -62,10 +62,10 @@ def require_matching_tensors(saved: Mapping[str, Tensor], own: Mapping[str, Tens
 
 
 def require_in_range(value: Tensor, low: int, high: int, what: str) -> None:
-    """Check that saved indices are between `low` and `high`; `what` is their name in the file, for the message.
+    """Check that saved integers are between `low` and `high`; `what` is their name in the file, for the message.
 
     Raises:
-        ValueError: with the smallest and largest index.
+        ValueError: if a value is outside; the message has the smallest and the largest value.
     """
     if value.numel() and not bool(((value >= low) & (value <= high)).all()):
         found = f"{int(value.min())} to {int(value.max())}"

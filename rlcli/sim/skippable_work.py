@@ -1,9 +1,9 @@
-"""Choice of the computations that MuJoCo can skip in a step of a certain model, without changing a bit of the state.
+"""Find the computations that MuJoCo can skip in a step of a model without changing a bit of the simulation.
 
 MuJoCo prepares collision detection even if no two geoms may touch, it prepares constraints even if the model can have
-none, and it searches constraint islands even in a model of one kinematic tree, which is one island. Its Python bindings
-also keep the profiler on, which reads the clock about thirty times per step, a third of the time of a small model: see
-`rlcli.sim.mujoco_private.without_profiler`.
+none, and it searches constraint islands even in a model of one kinematic tree, which is one island. (The profiler of
+MuJoCo's Python bindings, which takes a third of the time of a small model, is turned off by
+`rlcli.sim.mujoco_private.without_profiler`.)
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ FIELDS_OF_SKIPPED_WORK = frozenset(
 )
 """Fields of MjData that only the skipped computations write; if a task reads one of them, nothing is skipped."""
 FIELDS_OF_FRICTION = frozenset(["dof_frictionloss", "tendon_frictionloss"])
-"""Fields of MjModel, other than integers, that decide whether a model can have constraints."""
+"""Fields of MjModel with real numbers that decide whether a model can have constraints."""
 
 
 def skippable_flags(model: mujoco.MjModel) -> int:

@@ -1,6 +1,6 @@
-"""Copy of the engine's state in float32, from which the terms of a task read.
+"""Copy of the engine's state in float32, which the terms of a task read.
 
-Joint positions and velocities are copied once per step, derived fields such as xpos when a term reads them.
+Positions and velocities are copied once per step, derived fields such as xpos when a term reads them.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from rlcli.sim.env_selection import Columns, Selection, ids_of
 
 
 def is_finite(values: Tensor) -> bool:
-    """Return whether all values are finite; one pass is enough if they are, because then their sum is finite."""
+    """Return whether all values are finite; usually one pass is enough: a finite sum has only finite terms."""
     return math.isfinite(values.sum().item()) or bool(values.isfinite().all())
 
 
 class SimData:
-    """Copy of the engine's joint state in float32, made once per step, and of derived fields, made when they are read.
+    """Copy of the engine's qpos and qvel in float32, made once per step; derived fields are copied when they are read.
 
     `qpos` (num_envs, nq) and `qvel` (num_envs, nv) never change their storage, so views of them stay valid. If the two
     are neighbours in the engine's memory, they are copied together. For an engine in float32, `qpos` and `qvel` are the
@@ -44,18 +44,18 @@ class SimData:
         self.qpos = self._copies[0][:, : qpos.shape[1]]
         self.qvel = self._copies[-1][:, -qvel.shape[1] :] if qvel.shape[1] else self._copies[-1][:, :0]
         self.stamp = 0
-        """Number of updates of the state so far; a value that was cached at a smaller number is out of date."""
+        """Number of updates of the state so far; a value that was cached at another number is out of date."""
         self.command_stamp = 0
-        """Number of updates of the commands so far. With each update, the values that `once_per_goal` caches expire."""
+        """Number of updates of the commands so far; an update makes the values cached by `once_per_goal` outdated."""
         self._goals: dict[tuple[object, ...], tuple[tuple[int, int, int], Tensor]] = {}
         self._saved_at, self._summed = -1, (-1, 0.0)
         self._moved: Selection | None = None
         self._derived: dict[str, tuple[int, Tensor]] = {}
 
     def on_moved(self, selection: Selection) -> None:
-        """Update the derived fields of the selected worlds after a write to their state.
+        """Update the copies and the derived fields of the selected worlds; call it after a write to their state.
 
-        A GPU engine, which can only update all worlds at once, postpones this to the next read of a derived field.
+        A GPU engine can only update all worlds at once; with it, derived fields are updated at their next read.
         """
         if not self.engine.asynchronous:
             self.engine.forward(selection)
@@ -70,14 +70,14 @@ class SimData:
             self.engine.forward(selection)
 
     def refresh(self) -> None:
-        """Copy the joint state of every world from the engine."""
+        """Copy qpos and qvel of every world from the engine; values computed from the old state are outdated."""
         with np.errstate(over="ignore"):  # a value too large for float32 becomes infinity, which `is_finite` finds
             for copy, source in self._copied:
                 copy[...] = source
         self.stamp += 1
 
     def refresh_rows(self, selection: Selection) -> None:
-        """Copy the state of the selected worlds, and drop the values computed from it."""
+        """Copy qpos and qvel of the selected worlds from the engine; values computed from the old ones are outdated."""
         with np.errstate(over="ignore"):
             for copy, source in self._copied:
                 rows = ids_of(selection)
@@ -85,7 +85,7 @@ class SimData:
         self.stamp += 1
 
     def save_good_state(self) -> None:
-        """Save the state of every world for `restore_rows`."""
+        """Save qpos and qvel of every world for `restore_rows`; call it only when all are finite and within bounds."""
         if self._saved_at == self.stamp:
             return
         self._saved_at = self.stamp
@@ -93,7 +93,7 @@ class SimData:
             saved[...] = copy
 
     def restore_rows(self, selection: Selection) -> None:
-        """Write the last saved state of the selected worlds back to the engine."""
+        """Write qpos and qvel of the selected worlds, as `save_good_state` saved them last, back to the engine."""
         for saved, (_, source) in zip(self._saved, self._copied, strict=True):
             rows = ids_of(selection)
             source[rows] = saved[rows]
@@ -103,7 +103,10 @@ class SimData:
         return math.isfinite(self._squares()) or all(bool(flat.isfinite().all()) for flat in self._flat)
 
     def out_of_bounds(self, limit: float) -> Tensor | None:
-        """Return the worlds with a value that is not finite or beyond `limit`; None for none. (num_envs,) bool"""
+        """Return whether each world has a position or velocity that is not finite or beyond `limit`, (num_envs,) bool.
+
+        Return None if no world has one.
+        """
         # the sum of all squares is an upper bound of each, and not finite if one is not; 0.5 covers its rounding
         if self._squares() <= 0.5 * limit * limit:
             return None
@@ -132,7 +135,12 @@ class SimData:
     def once_per_goal(self, key: tuple[object, ...], command: Tensor, compute: Callable[[], Tensor]) -> Tensor:
         """Return `compute()`, cached under `key` until the state or the command changes.
 
-        It is for quantities that several terms need in a step, such as the distance to the goal of a pose command.
+        Terms use this for quantities that several of them need in a step, such as the distance to a goal.
+
+        Args:
+            key: name of the quantity, and what it depends on.
+            command: the command whose changes make the value outdated. (num_envs, ...)
+            compute: function that computes the value.
         """
         # torch counts its own writes to a tensor; commands that managers write through numpy change `command_stamp`
         writes = 0 if command.is_inference() else command._version
@@ -148,7 +156,7 @@ class SimData:
         return self._of_columns(name, columns).float()
 
     def derived_vectors(self, name: str, columns: Columns) -> Tensor:
-        """Return `derived_columns`, with contiguous vectors over the environments. (k, ..., num_envs)"""
+        """Return `derived_columns` with the environments as the last dimension, contiguous. (k, ..., num_envs)"""
         part = self._of_columns(name, columns).movedim(0, -1)
         return part.to(torch.float32, memory_format=torch.contiguous_format).contiguous()
 

@@ -1,4 +1,4 @@
-"""GPU engine on MuJoCo Warp: it steps all worlds together, in float32, and its steps can be part of a CUDA graph.
+"""GPU engine on MuJoCo Warp, which steps all worlds together, in float32; its steps can be part of a CUDA graph.
 
 The engine also runs on Warp's CPU device, slowly, for tests on machines without a GPU. Results are not bit-identical
 from run to run, because MuJoCo Warp adds with atomic operations.
@@ -102,10 +102,10 @@ class WarpEngine(WarpWorlds):
                 self._graphs[nstep, derive] = self._capture(nstep, derive)
 
     def diverged(self, motion_is_finite: bool = False) -> Tensor:
-        """Return the worlds that diverged in the last step, (num_envs,) bool.
+        """Return whether each world diverged in the last step, (num_envs,) bool.
 
-        The step has already restored the state of these worlds before the step, with controls and warm start set to 0.
-        This call also restores their requested derived fields.
+        `step` has already given these worlds their state before the step, with controls and warm start set to 0. This
+        method also restores their requested derived fields.
         """
         with self._launching():
             for name, last in self._last_derived.items():
@@ -115,7 +115,7 @@ class WarpEngine(WarpWorlds):
     def forward(self, selection: Selection) -> None:
         """Compute the requested derived fields (xpos, ...); forces and accelerations only in the selected worlds.
 
-        The present state of the selected worlds is saved. If a world diverges in the next step, it is restored.
+        The present state of the selected worlds is saved; it is restored in worlds that diverge in the next step.
         """
         assert isinstance(selection, MaskSelection)
         self._forward(selection)
@@ -140,7 +140,7 @@ class WarpEngine(WarpWorlds):
                 selection.write(self._fields[name].view(self.num_envs, -1), 0.0, columns)
 
     def set_default_state(self, qpos: Tensor, qvel: Tensor) -> None:
-        """Set the joint state that `reset` restores."""
+        """Set the positions and velocities that `reset` restores. (nq,), (nv,)"""
         self._default_qpos.copy_(qpos)
         self._default_qvel.copy_(qvel)
 
@@ -214,7 +214,7 @@ class WarpEngine(WarpWorlds):
             self._derive()
 
     def _check_bounds(self) -> None:
-        """Find diverged worlds and restore their last good state, before fields are derived from it."""
+        """Find diverged worlds and restore their last good state; derived fields are computed afterwards."""
         state = [self._arrays[name] for name in ("qpos", "qvel", "qacc_warmstart", "ctrl", "act")]
         inputs = [*state, self._data.overflow, self._max_velocity]
         results = (self._last_qpos, self._last_qvel, self._diverged, self._counts, self._first, self._overflowed)

@@ -25,7 +25,13 @@ OVERFLOW_SETTINGS = {
 def put_on_device(
     model: mujoco.MjModel, num_envs: int, device: torch.device, capacity: Capacity
 ) -> tuple[mjw.Model, mjw.Data]:
-    """Copy a model and its worlds to a device, which must be Warp's current device.
+    """Allocate a model and its worlds on a device, which must be Warp's current device; return model and data.
+
+    Args:
+        model: the compiled model.
+        num_envs: number of worlds.
+        device: the device.
+        capacity: numbers of contacts and constraints for which each world gets memory.
 
     Raises:
         ConfigError: for a model that MuJoCo Warp cannot run.
@@ -52,7 +58,7 @@ def put_on_device(
 
 
 def overflow_error(found: int, capacity: Capacity) -> DivergedError:
-    """Return the error for exceeded capacities; `found` is the sum of their flags, the keys of `OVERFLOW_SETTINGS`."""
+    """Return the error for exceeded capacities; `found` is the sum of their flags (keys of `OVERFLOW_SETTINGS`)."""
     settings = {setting for bit, setting in OVERFLOW_SETTINGS.items() if found & int(bit)}
     kinds = " and ".join(bit.name.lower() for bit in OVERFLOW_SETTINGS if found & int(bit) and bit.name)
     now = {"contacts_per_env": capacity.contacts, "constraints_per_env": capacity.constraints}
@@ -75,7 +81,7 @@ def _memory_error(model: mujoco.MjModel, num_envs: int, device: torch.device, ca
     free = wp.device_from_torch(device).free_memory if device.type == "cuda" else 0
     needed, fits = each * num_envs / 2**30, max(1, int(0.8 * free / each))
     return DeviceError(
-        f"{num_envs} environments need {needed:.1f} GiB, {free / 2**30:.1f} GiB are free on {device}",
+        f"{num_envs} environments need {needed:.1f} GiB of memory, but {free / 2**30:.1f} GiB are free on {device}",
         hint=f"use at most --num-envs {fits}",
     )
 

@@ -1,6 +1,6 @@
-"""Table of the fields of MjData in the GPU engine, with the stage of a step that computes each of them.
+"""Table of the fields of MjData, with the stage of a physics step that computes each field, for the GPU engine.
 
-The engine computes only the stages whose fields a task reads.
+The GPU engine computes only the stages whose fields a task reads.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ _MOTION_SENSORS = frozenset(
 )
 """Sensors of the position and velocity stages that need only the motion of bodies."""
 KINEMATICS, VELOCITY, FORCE = range(3)
-"""Groups of derived fields, by the stage that computes them."""
+"""Stages of a physics step that compute derived fields: from positions, from velocities, and forces."""
 
 
 class FieldStages:
-    """Lookup of the stages of a MuJoCo step that compute each MjData field of a model."""
+    """Lookup of the stages of a physics step that compute each MjData field of a model."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
         force_columns = force_sensor_columns(model)

@@ -1,6 +1,6 @@
 """Warp kernels of the GPU engine: counter-based random numbers, the check for divergence, resets by mask.
 
-Each kernel replaces about ten launches of torch: in a captured step, the number of launches determines the time.
+Each kernel replaces about ten kernel launches of torch: in a CUDA graph, the number of launches determines the time.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Base class of the GPU engine that holds its worlds (one per environment) and their states.
+"""Base class of the GPU engine that holds its worlds (one for each environment) and their states.
 
-It also gives worlds their own values of model fields, for domain randomization.
+For domain randomization, the class also gives each world its own values of model fields.
 """
 
 from __future__ import annotations
@@ -86,7 +86,11 @@ class WarpWorlds:
         return attribute in _batched_fields(owner) and getattr(owner, attribute, None) is not None
 
     def expand(self, name: str) -> Tensor:
-        """Give every world its own values of a model field; return a writable view of the values. (num_envs, ...)"""
+        """Give every world its own values of a model field; return a writable view of the values. (num_envs, ...)
+
+        Raises:
+            ValueError: if the field cannot differ between worlds.
+        """
         if name not in self._expanded:
             owner, attribute = self._owner(name)
             if not self.can_expand(name):
@@ -102,7 +106,7 @@ class WarpWorlds:
         return self._expanded[name]
 
     def expanded(self, name: str) -> Tensor | None:
-        """Return a model field for which each world has its own values; None if all worlds share the model's."""
+        """Return a model field for which each world has its own values, (num_envs, ...); None if all share a value."""
         return self._expanded.get(name)
 
     def expanded_fields(self) -> list[str]:
@@ -110,7 +114,7 @@ class WarpWorlds:
         return list(self._expanded)
 
     def set_constants(self, selection: Selection | None = None) -> None:
-        """Recompute the constants that MuJoCo derives from model fields, in all worlds."""
+        """Recompute the constants that MuJoCo derives from model fields, in all worlds; `selection` is not used."""
         for name in (*_CONSTANTS, *(_BOUNDS if "geom_size" in self._expanded else ())):
             array = getattr(self._model, name, None)
             if array is not None and array.size:
@@ -119,15 +123,19 @@ class WarpWorlds:
             mjw.set_const(self._model, self._data)
 
     def field(self, name: str) -> Tensor:
-        """Return a live view of an MjData field. A derived field (xpos, ...) is computed by every later `step`."""
+        """Return a live view of an MjData field, (num_envs, ...); later steps compute a derived field (xpos, ...).
+
+        Raises:
+            ValueError: if MuJoCo Warp's data has no such field with a row for each world.
+        """
         if name not in self._fields:
             array = getattr(self._data, name, None)
             if not isinstance(array, wp.array) or array.ndim == 0 or array.shape[0] != self.num_envs:
                 names = [f.name for f in dataclasses.fields(self._data)]
                 if name in names:
                     raise ValueError(
-                        f"field '{name}' of mujoco_warp.Data is shared by all environments, so it cannot be read as"
-                        " (num_envs, ...); use another field"
+                        f"field '{name}' of mujoco_warp.Data has no row for each environment; use a field with rows for"
+                        " environments"
                     )
                 hint = did_you_mean(name, names) or "see mujoco_warp.Data"
                 raise ValueError(f"'{name}' is not a field of MuJoCo Warp's data; {hint}")
@@ -153,7 +161,7 @@ class WarpWorlds:
         return self._fields[name]
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return copies of the state, of the requested inputs, and of the model fields with a value for each world."""
+        """Return copies of the state, the requested inputs and the model fields that differ between worlds, by name."""
         inputs = [name for name in INPUTS if name in self._fields]
         return {
             **{name: self.field(name).clone() for name in (*STATE, *inputs)},
@@ -168,8 +176,8 @@ class WarpWorlds:
         for name, values in substate(state, "model.").items():
             if not values.is_floating_point() and self.expanded(name) is None:
                 raise ValueError(
-                    f"the saved state has values of model field '{name}' for each environment, and this task has none;"
-                    " restore the events and the code of the saved state"
+                    f"the saved state has values of model field '{name}' for each environment, but the task has none;"
+                    " restore the events and the code with which the state was saved"
                 )
             require_matching_tensors({name: values}, {name: self.expand(name)}, "engine")
             self.expand(name).copy_(values)
@@ -209,10 +217,10 @@ class WarpWorlds:
         return model, data
 
     def _update_velocities(self) -> None:
-        """Compute the velocities of bodies before connect and weld constraints use them.
+        """Compute the velocities of bodies, which connect and weld constraints use in the next step.
 
-        MuJoCo Warp 4.0 makes these constraints before it updates the velocities, so the constraints would use those of
-        the step before, or of the episode before.
+        MuJoCo Warp 4.0 computes these constraints before it updates the velocities, so the constraints would use the
+        velocities of the previous step or episode.
         """
         if self._holds_bodies:
             mjw.fwd_kinematics(self._model, self._data)
@@ -255,12 +263,12 @@ class WarpWorlds:
         return (self._model.opt, name[4:]) if name.startswith("opt.") else (self._model, name)
 
     def _launching(self) -> wp.ScopedDevice:
-        """Return a context in which Warp launches on the engine's device."""
+        """Return a context in which Warp launches kernels on the engine's device."""
         return wp.ScopedDevice(self._device)
 
     @contextlib.contextmanager
     def _setting_up(self) -> Iterator[None]:
-        """Context in which Warp launches on the engine's device and, on a GPU, on torch's stream."""
+        """Let Warp launch kernels in a `with` block on the engine's device and, on a GPU, on torch's stream."""
         is_gpu = self.device.type == "cuda"
         stream = wp.stream_from_torch(torch.cuda.current_stream(self.device)) if is_gpu else None
         with self._launching(), wp.ScopedStream(stream):

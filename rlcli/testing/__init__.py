@@ -1,7 +1,7 @@
 """Checks and linter for authors of tasks; both run the task.
 
-The checks test the rules that every task must keep (its contract), for shapes, seeds, resets and others. The linter
-looks for properties that make learning hard. `rlcli check`, `rlcli lint` and the pytest plugin use them.
+The checks test the rules for shapes, seeds, resets and so on that every task must keep (its contract). The linter looks
+for properties that make learning hard. `rlcli check`, `rlcli lint` and the pytest plugin call this package.
 
 ```python
 from rlcli.testing import check_task

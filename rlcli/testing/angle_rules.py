@@ -1,7 +1,4 @@
-"""Rules of the linter for angles that are probably in degrees, or radians that are read as degrees.
-
-They are part of `rlcli lint`.
-"""
+"""Rules of `rlcli lint` for angles that are probably in degrees, and for radians that are read as degrees."""
 
 from __future__ import annotations
 
@@ -22,7 +19,7 @@ _LARGEST_ANGLES = {
 }
 """(section, key) of a parameter -> largest sensible angle [rad]; a larger one may be in degrees. A tilt is at most pi.
 
-Joint positions are among them, so that a slide by more than 6.28 m is reported, too."""
+Joint positions are among the parameters, so that a slide by more than 6.28 m is reported, too."""
 
 
 def degrees(evidence: RolloutEvidence) -> Iterator[Remark]:
@@ -35,13 +32,14 @@ def degrees(evidence: RolloutEvidence) -> Iterator[Remark]:
         numbers = [v for v in (value if isinstance(value, list | tuple) else [value]) if isinstance(v, int | float)]
         largest = max(map(abs, numbers), default=0.0)
         if bound is not None and bound * 1.01 < largest < math.inf:
-            message = f"the angle {largest:g} is above {bound / math.pi:g} pi; angles are in radians"
+            message = f"the angle {largest:g} rad is above {bound / math.pi:g} pi; angles are in radians"
             hint = f"write {math.radians(largest):.4g}, if {largest:g} is in degrees"
             yield warning_at(".".join(map(str, path)), message, hint, {"angle": largest})
     for name, condition in evidence.subject.resolved.task.success.items():
         bound_of_tilt = None if condition is None or condition.func != "root_tilt" else condition.at_most
         if bound_of_tilt is not None and bound_of_tilt > math.pi:
-            message = f"the tilt {bound_of_tilt:g} is above pi, so the condition always holds; angles are in radians"
+            message = f"the tilt {bound_of_tilt:g} rad is above pi, so the condition always holds"
+            message += "; angles are in radians"
             hint = f"write {math.radians(bound_of_tilt):.4g}, if {bound_of_tilt:g} is in degrees"
             yield warning_at(f"success.{name}.at_most", message, hint, {"angle": bound_of_tilt})
 

@@ -1,7 +1,7 @@
-"""Runner of the checks of `rlcli check`, which test a task's contract.
+"""Run the checks of `rlcli check`, which test whether a task keeps its contract.
 
-The contract is what trainers and checkpoints rely on: shapes, seeds, resets and others.
-An error in a check becomes a finding, and the other checks still run.
+The contract is the rules for shapes, seeds, resets and so on, on which trainers and checkpoints rely. An error in a
+check becomes a finding, and the other checks still run.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _IN_ORDER: tuple[Check, ...] = (
     *(_equivalence.num_envs, _equivalence.speed, _equivalence.engines, _equivalence.captured),
 )
 CHECKS = {check.__name__.replace("_", "-"): check for check in _IN_ORDER}
-"""Name -> check, in the order in which they run; `docs/tutorials/first-plugin.md` lists them.
+"""Name -> check, in the order in which the checks run; `docs/tutorials/first-plugin.md` lists all checks.
 
 The first line of a check's docstring is its requirement."""
 
@@ -56,25 +56,25 @@ def check_task(
     on_check: OnCheck = lambda name, findings: None,
     on_note: OnNote = lambda name, text: None,
 ) -> list[Finding]:
-    """Check a task against the contract.
+    """Check whether a task keeps the contract: the rules for shapes, seeds, resets and so on that every task must keep.
 
     Args:
         task: a name from `list-tasks`, or a folder with a `task.yaml`.
-        agent: the agent whose changes to the task and action bound are used; None: the default agent.
+        agent: name of the agent whose changes to the task and action bound are used; None: the default agent.
         overrides: `key.path=value`, as on the command line.
-        config: a further configuration file, as that of `--config`.
-        num_envs: number of environments, whatever the task's number is; at least 8.
+        config: a further configuration file, like that of `--config`; None: no file.
+        num_envs: number of environments, which replaces the task's number; at least 8.
         seed: seed of the environments and of the actions.
         only: names of checks to run; all if empty.
-        on_check: called after each check with its name and findings; with None for a check that was not run.
-        on_note: called after a check with its name and a note: why it was not run, or what it measured.
+        on_check: called after each check with the check's name and findings; with None if the check was not run.
+        on_note: called after a check with its name and a note: why the check was not run, or what it measured.
 
     Returns:
-        Violations of the contract; empty if there are none.
+        The violations of the contract; empty if there are none.
 
     Raises:
-        UsageError: for a check that does not exist, or fewer than 8 environments.
-        ConfigError: if the files are not valid; `rlcli validate` prints the same errors.
+        UsageError: for the name of a check that does not exist, or fewer than 8 environments.
+        ConfigError: if the task's files are not valid; `rlcli validate` prints the same errors.
         TaskError: if there is no such task, or the task cannot be imported.
     """
     for name in only:
@@ -132,7 +132,7 @@ def _build(subject: TaskUnderTest) -> Iterator[Finding]:
             # the environment checks the shape of a term's first value while it is built
             check = "shapes" if isinstance(error, ShapeError) else "names"
             where = f"{problem.where}: {problem.path}" if problem.path else problem.where
-            hint = problem.hint or "correct it; `rlcli validate --deep` reports it too"
+            hint = problem.hint or "correct this setting; `rlcli validate --deep` reports the same problem"
             yield Finding(check, "error", where, problem.message, hint)
     except (TaskError, DependencyError, DeviceError, MachineError):
         raise
@@ -153,6 +153,6 @@ def _run(name: str, subject: TaskUnderTest, before: list[Finding]) -> Iterator[F
 def _stopped(name: str, subject: TaskUnderTest, error: Exception, before: list[Finding]) -> Finding:
     message = f"the check was stopped by {task_error_text(error)}"
     earlier = next((f.check for f in before if f.message == message), None)
-    advice = getattr(error, "hint", None) or "correct the code that raises it, then check again"
-    hint = advice if earlier is None else f"first correct what the check {earlier} reports: it is the same error"
+    advice = getattr(error, "hint", None) or "correct the code that raises this error, then check again"
+    hint = advice if earlier is None else f"first correct what the check {earlier} reports: the error is the same"
     return Finding(name, "error", subject.location(error), message, hint)

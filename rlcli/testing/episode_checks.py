@@ -27,14 +27,14 @@ from rlcli.testing.steps import (
 from rlcli.testing.task_under_test import TaskUnderTest, column_names, engine_state, expire_episodes, task_of
 
 _ENDING = [1, 4, 5]
-"""Indices of the environments whose episodes a check ends, while the episodes of the others continue."""
+"""Indices of the environments whose episodes a check ends, while the episodes of the other environments continue."""
 _LIMITS = (6, 9)
-"""Two episode lengths [steps] that a check sets as time limit; episodes that end exactly then depend on the limit."""
+"""Two time limits [steps] that a check sets: an episode that ends exactly at both limits ends because of the limit."""
 
 Trajectory = list[dict[str, Tensor]]
 """Outputs of each step: name, such as `reward` -> tensor with one row for each environment."""
 MakeFinding = Callable[[str, str, str], Finding]
-"""Type of the functions `error_at` and `warning_at`, which make a finding from (where, message, hint)."""
+"""Type of the functions `error_at` and `warning_at`, which return a finding with (where, message, hint)."""
 
 
 def same_seed(subject: TaskUnderTest) -> Iterator[Finding]:
@@ -46,7 +46,7 @@ def same_seed(subject: TaskUnderTest) -> Iterator[Finding]:
     findings = _seed_differences(subject)
     if findings and subject.resolved.format is not None:
         others = _seed_differences(subject, seeds_torch=True)
-        hint = "nothing to do for trainings: they seed torch's generator, so that the same --seed repeats them"
+        hint = "nothing to do: a training seeds torch's generator, so that the same --seed repeats the training"
         findings = others or [
             warning_at(each.where, f"{each.message} (from torch's generator)", hint) for each in findings
         ]
@@ -79,7 +79,7 @@ def _seed_differences(subject: TaskUnderTest, seeds_torch: bool = False) -> list
     hint = "sample with selection.uniform (normal, choice) or self.draws(env_ids), not with torch.rand or numpy or time"
     findings = list(compare_trajectories(env, (first, second), message, hint))
     if not findings:
-        message = "this output of the step differs between a new environment and the same one after reset(seed)"
+        message = "this output of the step differs between a new environment and the same environment after reset(seed)"
         hint = "clear all state of the last episode in the term's reset(selection), or in reset_idx"
         findings = list(compare_trajectories(env, (first, third), message, hint))
     return findings
@@ -91,9 +91,9 @@ def compare_trajectories(
     """Report the first difference of two trajectories, if they are not equal bit for bit.
 
     Args:
-        env: an environment with the layout of the trajectories.
+        env: an environment with the layout (names of columns) of the trajectories.
         trajectories: both trajectories, equally long.
-        message: message without the values, which are appended.
+        message: message of the finding; the differing values are appended.
         hint: hint of the finding.
         make: `error_at` or `warning_at`.
     """
@@ -130,18 +130,18 @@ def start_states(subject: TaskUnderTest) -> Iterator[Finding]:
     second = _start(env, env.reset())
     hint = "add an event of mode reset with a range (reset_joints_by_offset), or draws(env_ids).uniform in reset_idx"
     if bool((first == first[0]).all()):
-        message = f"the start states of {env.num_envs} environments are all the same; they must vary"
+        message = f"the start states of {env.num_envs} environments are all the same; start states must vary"
         yield error_at("between environments", message, hint)
     if equal_values(first, second):
-        message = "two episodes in a row start in the same states; they must vary"
+        message = "two episodes in a row start in the same states; start states must vary"
         yield error_at("between episodes", message, hint)
     with contextlib.suppress(Exception):  # other checks report the error of a step
         env.step(torch.zeros(env.num_envs, env.layout.action_size))
         held = [name for name, share in env.condition_shares().items() if share == 1.0]
         if held:
             subject.notes["start-states"] = (
-                f"success: {', '.join(held)} holds already after the first step in all {env.num_envs} environments:"
-                " right for a state to keep, but wrong for a goal to reach"
+                f"success: {', '.join(held)} holds already after the first step in all {env.num_envs} environments;"
+                " this is right if the policy must keep a state, and wrong if it must reach a goal"
             )
 
 
@@ -152,11 +152,11 @@ def _start(env: VecEnv, obs: dict[str, Tensor]) -> Tensor:
 
 
 class _EnvPair:
-    """Two environments, `kept` and `ended`, with equal states until their actions or their episodes' ends differ.
+    """Two objects of a task's environments, `kept` and `ended`, with equal states until a check makes them differ.
 
     Args:
         subject: the task.
-        scale: the second environment gets the actions of the first one times this factor.
+        scale: factor of the random actions in `ended`; with 1 both get the same actions.
     """
 
     def __init__(self, subject: TaskUnderTest, scale: float = 1.0) -> None:
@@ -167,7 +167,7 @@ class _EnvPair:
             env.reset(seed=env.seed)
 
     def step(self, count: int = 1) -> tuple[StepResult, StepResult]:
-        """Step both environments with the next random actions; return their results of the last step."""
+        """Step `kept` and `ended` with the next random actions, `count` times; return both results of the last step."""
         for _ in range(count):
             action = next(self._actions)
             self._steps += 1
@@ -179,9 +179,9 @@ class _EnvPair:
 
 
 def _env_pair(subject: TaskUnderTest) -> _EnvPair:
-    """Return two environments in equal states, for checks of partial resets.
+    """Return a pair in equal states, for checks of partial resets.
 
-    In the next step the episodes of the environments `_ENDING` end in `ended`, and none ends in `kept`.
+    In the next step the episodes of the environments `_ENDING` reach their time limit in `ended`, but not in `kept`.
     """
     pair = _EnvPair(subject)
     pair.step(5)
@@ -202,13 +202,14 @@ def partial_reset(subject: TaskUnderTest) -> Iterator[Finding]:
                 later = f", {number} steps later" if number else ""
                 where = "the simulation's state" if name == "state" else name
                 message = f"values of environments {rows} changed when environments {_ENDING} were reset{later}"
-                hint = "write only the rows of the environments that reset (`selection` or `env_ids`), and no averages"
-                yield error_at(where, f"{message}; they must stay bit-identical", hint)
+                hint = "write only to the rows of the environments that reset (`selection` or `env_ids`), and use no"
+                hint += " averages over environments"
+                yield error_at(where, f"{message}; these values must stay bit-identical", hint)
                 return
 
 
 def final_observations(subject: TaskUnderTest) -> Iterator[Finding]:
-    """Check that a step returns the last observation of an ended episode, not the first one of the new episode."""
+    """Check that a step returns the last observation of an ended episode, not the first observation of the next."""
     result = _env_pair(subject).step()[1]
     done = (result.terminated | result.truncated)[_ENDING]
     if not bool(done.all()):
@@ -220,15 +221,15 @@ def final_observations(subject: TaskUnderTest) -> Iterator[Finding]:
     for group, values in result.final_obs.items():
         stale = [row for row in _ENDING if equal_values(values[row], result.obs[group][row])]
         if stale:
-            message = f"the first observation of the new episode equals the last one of the old in environments {stale}"
+            message = f"the first observation of a new episode equals the last of the old one in environments {stale}"
             hint = "compute observations from the state at every call, and let the reset change the state"
             yield error_at(f"observations.{group}", message, hint)
 
 
 def _episode_ends(subject: TaskUnderTest, limit: int) -> list[EndedEpisode]:
-    """Return how episodes with a limit of `limit` steps end under zero actions, within the time of two episodes.
+    """Return how episodes with a time limit of `limit` steps end under zero actions, in about 2 * `limit` steps.
 
-    If an episode exceeds the limit, the last item stands for it, with a length of `limit + 1`.
+    If an episode exceeds the limit, the last item has the length `limit + 1`.
     """
     env = subject.env(episode_steps=limit)
     env.reset(seed=env.seed)
@@ -242,7 +243,7 @@ def _episode_ends(subject: TaskUnderTest, limit: int) -> list[EndedEpisode]:
 
 
 def back_fill(subject: TaskUnderTest) -> Iterator[Finding]:
-    """Check that the first observation of an episode has no values of the last episode in histories and buffers."""
+    """Check that the first observation of an episode has no values of the previous episode in histories and buffers."""
     task = subject.resolved.task
     if task.scene.terrain is not None:
         raise NotRunError("on terrain the start of an episode depends on the previous one: nothing to compare")
@@ -303,7 +304,7 @@ def truncation(subject: TaskUnderTest) -> Iterator[Finding]:
 
 def termination(subject: TaskUnderTest) -> Iterator[Finding]:
     """Check that no time-out is reported as a termination."""
-    hint = "declare it with `time_out: true`, or leave the time limit to rlcli and remove it from is_done"
+    hint = "declare the termination with `time_out: true`, or leave the time limit to rlcli and remove it from is_done"
     ends_of = {limit: _episode_ends(subject, limit) for limit in _LIMITS}
     for before in (0, 1):
         reached = [[e for e in ends if e.length >= limit - before] for limit, ends in ends_of.items()]
@@ -334,7 +335,7 @@ def _declared(subject: TaskUnderTest, cause: str) -> bool:
 
 def repeated_observation(subject: TaskUnderTest) -> Iterator[Finding]:
     """Check that computing the observation of a state a second time gives the same values."""
-    hint = "compute it only from the state; advance histories and counters when actions are applied"
+    hint = "compute observations only from the state; advance histories and counters when actions are applied"
     for where, (before, after) in _observe_twice(_env_pair(subject)).items():
         if not equal_values(before, after):
             yield error_at(where, "the observation changes when it is computed a second time in the same state", hint)

@@ -1,7 +1,4 @@
-"""Data class `Finding`, the result of a check of `rlcli check`, and the exception of a check that does not apply.
-
-A check yields a finding for each violation of its rule.
-"""
+"""Data class `Finding`, a violation found by a check of `rlcli check`, and exception of a check that does not apply."""
 
 from __future__ import annotations
 
@@ -20,7 +17,7 @@ class Finding:
     check: str
     """Name of the check."""
     severity: Literal["error", "warning"]
-    """Only errors fail `rlcli check`."""
+    """error: `rlcli check` ends with an exit code other than 0; warning: it does not."""
     where: str
     """Part of the task, such as a term or a column."""
     message: str
@@ -40,14 +37,14 @@ warning_at = partial(Finding, "", "warning")
 
 
 class NotRunError(Exception):
-    """Raised by a check that does not apply to this task or this machine; the message is the reason."""
+    """Exception of a check that does not apply to this task or this machine; the message is the reason."""
 
 
 def task_error_text(error: Exception) -> str:
     """Return the type and the message of an error that a task raised in a check, as one line for a finding.
 
     Raises:
-        MachineError: for an error that means too little memory, which no change of the task corrects.
+        MachineError: if the error is due to too little memory, which is no defect of the task.
     """
     if too_little := memory_error(error):
         raise too_little from error

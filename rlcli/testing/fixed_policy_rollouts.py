@@ -1,6 +1,6 @@
-"""Fixed policies (zero, random, bang-bang, sine) and their recorded rollouts, which the linter checks.
+"""Fixed policies (zero, random, bang-bang, sine) and their recorded rollouts, from which the linter judges a task.
 
-The policies need no training, so the linter can judge a task before any training.
+Fixed policies need no training, so the linter can run before any training.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from rlcli.testing.steps import EndedEpisode, ended_episodes
 from rlcli.testing.task_under_test import TaskUnderTest, element_names
 
 MAX_STEPS = 1000
-"""Largest length of a rollout if the user sets no duration [steps]."""
+"""Largest length of a rollout [steps], if the user sets no duration (`rlcli lint --seconds`)."""
 FixedPolicy = Callable[[int], Tensor]
 """Function from the index of a step to the actions of all environments. (num_envs, a)"""
 
@@ -33,7 +33,7 @@ SINE_HZ = (0.25, 2.0)
 
 
 def zero(env: VecEnv, bound: float) -> FixedPolicy:
-    """Return a policy that always sends a zero action."""
+    """Return a policy whose actions are always zero."""
     return lambda step: torch.zeros(env.num_envs, env.layout.action_size)
 
 
@@ -73,7 +73,7 @@ FIXED_POLICIES: dict[str, Callable[[VecEnv, float], FixedPolicy]] = {
     "bang-bang": bang_bang,
     "sine": sine,
 }
-"""Name of a policy -> function that makes it for an environment and an action bound, in the order of the rollouts."""
+"""Name of a policy -> function (environment, action bound) that returns the policy, in the order of the rollouts."""
 
 
 @dataclass(slots=True)
@@ -81,26 +81,30 @@ class Rollout:
     """Rollout of one fixed policy in a task. Tensors are (steps, num_envs, ...)."""
 
     policy: str
+    """Name of the policy, a key of `FIXED_POLICIES`."""
     env: VecEnv
     reward: Tensor
     done: Tensor
     """Whether the episode ended with this step. bool"""
     terminated: Tensor
+    """Whether a termination ended the episode with this step. bool"""
     terms: dict[str, Tensor]
     """Reward term -> its reward, weight included; empty for a direct task."""
     obs: dict[str, Tensor]
-    """Group -> observations, beginning with those of the reset."""
+    """Group -> observations, beginning with those of the reset. (steps + 1, num_envs, d) each"""
     episodes: list[EndedEpisode]
-    """Episodes that ended before the rollout did."""
+    """Episodes that ended during the rollout."""
     unfinished: list[int]
     """Lengths of the episodes that the end of the rollout has cut off."""
     limited: dict[str, float]
-    """Name of an effort, a control or an action column -> share of the steps in which it was at its limit. It is
-    recorded only for the policy `random`."""
+    """Name of an effort, a control or an action column -> share of the steps in which the quantity was at its limit;
+    empty except for the policy `random`."""
     speed: Tensor
-    """Root mean square of each velocity. (nv,)"""
+    """Root mean square of each velocity (qvel). (nv,)"""
     diverged: int
+    """Number of divergences."""
     error: Exception | None = None
+    """The error that ended the rollout; None: no error."""
 
 
 def record_rollout(env: VecEnv, policy: str, bound: float, steps: int) -> Rollout:
@@ -163,7 +167,10 @@ def _append(lists: defaultdict[str, list[Tensor]], values: dict[str, Tensor]) ->
 
 
 class _PhysicsObserver(StepObserver):
-    """Observer that records velocities after physics, before any reset; with `limits` also saturated efforts."""
+    """Observer that records velocities after the physics steps, before any reset.
+
+    If `limits`, it also records which efforts, controls and action columns are at their limits.
+    """
 
     def __init__(self, env: VecEnv, *, limits: bool) -> None:
         self._env, self._limits = env, limits
@@ -171,8 +178,8 @@ class _PhysicsObserver(StepObserver):
         self.squares: Tensor | None = None
         """Sum over the steps of each squared velocity, averaged over the environments. (nv,)"""
         self.shares: defaultdict[str, float] = defaultdict(float)
-        """Name of an effort, control or action column -> sum over the steps of the share of environments at its
-        limit."""
+        """Name of an effort, control or action column -> sum over the steps of the share of environments in which the
+        quantity is at its limit."""
 
     def after_physics(self) -> None:
         env, model = self._env, self._env.engine.model
@@ -196,7 +203,7 @@ class _PhysicsObserver(StepObserver):
             self.shares[name] += float(((control <= low + slack) | (control >= high - slack)).float().mean())
 
     def add_clipped_columns(self, action: Tensor) -> None:
-        """Record which columns of the action are clipped before they become commands."""
+        """Record which columns of the action (num_envs, a) are clipped before they become commands."""
         column = 0
         for term in self._env.layout.actions:
             for index, name in enumerate(element_names(term.elements, term.size)):
@@ -211,7 +218,12 @@ class _PhysicsObserver(StepObserver):
 
 
 class RolloutEvidence:
-    """Data that the lint rules read: a rollout of each fixed policy, recorded on first use, and new environments."""
+    """Data that the lint rules read: a rollout of each fixed policy, recorded on first use, and new environments.
+
+    Args:
+        subject: the task.
+        seconds: simulated time of each rollout [s]; None: one episode, at most `MAX_STEPS` steps.
+    """
 
     def __init__(self, subject: TaskUnderTest, seconds: float | None) -> None:
         self.subject = subject
@@ -222,7 +234,7 @@ class RolloutEvidence:
 
     @property
     def rollouts(self) -> list[Rollout]:
-        """One rollout of each policy of `FIXED_POLICIES`; recorded when it is first read."""
+        """One rollout of each policy of `FIXED_POLICIES`; all are recorded at the first access."""
         if self._rollouts is None:
             bound = self.subject.bound
             names = tracked(FIXED_POLICIES, "policies", len(FIXED_POLICIES))
@@ -235,7 +247,10 @@ class RolloutEvidence:
         return any(rollout.error is not None for rollout in self._rollouts or ())
 
     def env(self, num_envs: int | None = None, **settings: Any) -> VecEnv:
-        """Return a new environment with further settings; in their names `__` stands for a dot."""
+        """Return a new environment of the task with further settings, such as `sim__dt=0.01` for the key `sim.dt`.
+
+        `num_envs` is the number of environments; None: that of the checks.
+        """
         flags = {key.replace("__", "."): value for key, value in settings.items()}
         # all cores: the number of engine threads does not change the results
         return self.subject.env(

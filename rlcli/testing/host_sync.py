@@ -1,6 +1,6 @@
-"""Detection of host syncs: operations of torch for which the CPU (host) must wait until a GPU has computed a value.
+"""Detect host syncs: operations of torch for which the CPU (host) must wait until a GPU has computed a value.
 
-The check of `rlcli check` for GPUs uses it on a CPU.
+The check `captured` of `rlcli check` uses the detection, which works without a GPU.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ _MASKED = ("index", "index_put", "index_put_")
 
 
 class HostSyncError(AssertionError):
-    """Raised when a step reads a value back to the host."""
+    """Error for an operation that forces a host sync, or copies numbers from the host."""
 
 
 class HostSyncGuard(TorchDispatchMode):  # type: ignore[no-untyped-call]  # torch has no type here
-    """Dispatch mode that raises `HostSyncError` at operations that force a host sync, on any device."""
+    """Context in which torch operations that would force a host sync on a GPU raise `HostSyncError`, on any device."""
 
     def __torch_dispatch__(
         self, func: Any, types: Any, args: Sequence[Any] = (), kwargs: Mapping[str, Any] | None = None
     ) -> Any:
-        """Raise for operations that force a host sync, and execute all others."""
+        """Execute a torch operation; raise `HostSyncError` if it would force a host sync. torch calls this method."""
         name = func.overloadpacket.__name__
         if name in SYNC_OPS:
             raise HostSyncError(f"'{name}' forces a host sync (the CPU waits for the GPU); compute with tensors only")

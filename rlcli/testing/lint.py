@@ -1,4 +1,4 @@
-"""Linter of tasks: it finds properties that make learning hard, also in tasks that pass `rlcli check`.
+"""Linter of tasks (`rlcli lint`), which finds properties that make learning hard, even if a task passes `rlcli check`.
 
 ```python
 from rlcli.testing import lint_task
@@ -39,14 +39,15 @@ def lint_task(
     ignore: Sequence[str] = (),
     on_rule: Callable[[str, list[Remark]], None] = lambda name, remarks: None,
 ) -> list[Remark]:
-    """Run a task with fixed policies and apply the rules to their rollouts.
+    """Run a task with fixed policies, such as random actions, and apply the rules of the linter to the rollouts.
 
     Args:
         task: a name from `list-tasks`, or a folder with a `task.yaml`.
-        agent: the agent whose changes to the task, action bound and discount are used; None: the default agent.
+        agent: name of the agent whose changes to the task, action bound and discount factor are used; None: the
+            default agent.
         overrides: `key.path=value`, as on the command line.
-        config: a further configuration file, as that of `--config`.
-        num_envs: number of environments of each rollout, whatever the task's number is; at least 8.
+        config: a further configuration file, like that of `--config`; None: no file.
+        num_envs: number of environments of each rollout, which replaces the task's number; at least 8.
         seed: seed of the environments and of the fixed policies.
         seconds: simulated time of each rollout [s]; None: one episode, but at most 1000 steps.
         only: names of rules; all if empty.
@@ -54,17 +55,17 @@ def lint_task(
         on_rule: called after each rule with its name and remarks.
 
     Returns:
-        Obstacles to learning; empty if there are none.
+        A remark for each obstacle to learning; empty if there are none.
 
     Raises:
-        UsageError: for a rule that does not exist, or fewer than 8 environments.
+        UsageError: for the name of a rule that does not exist, `seconds` not above 0, or fewer than 8 environments.
         ConfigError: if the task is not valid; `rlcli validate --deep` prints the same errors.
         TaskError: if there is no such task, or the task cannot be imported.
     """
     for name in (*only, *ignore):
         require_known(name, list(RULES), "rule", "rules")
     if seconds is not None and not (math.isfinite(seconds) and seconds > 0.0):
-        raise UsageError(f"--seconds {seconds:g} is not a duration", hint="give simulated seconds, above 0")
+        raise UsageError(f"--seconds {seconds:g} is not a duration", hint="give a simulated time above 0 [s]")
     evidence = RolloutEvidence(open_task(task, agent, overrides, config, num_envs, seed), seconds)
     found: list[Remark] = []
     with torch.random.fork_rng(devices=[]):
@@ -97,5 +98,5 @@ def _apply_rule(name: str, evidence: RolloutEvidence) -> Iterator[Remark]:
         raise
     except Exception as error:
         message = f"the rule was stopped by {task_error_text(error)}"
-        hint = getattr(error, "hint", None) or "correct the code that raises it, then lint again"
+        hint = getattr(error, "hint", None) or "correct the code that raises this error, then lint again"
         yield Remark(name, "error", evidence.subject.location(error), message, hint)

@@ -1,6 +1,6 @@
-"""Rules of `rlcli lint`: each finds one obstacle to learning in the recorded rollouts of fixed policies.
+"""Rules of `rlcli lint`, each of which finds one obstacle to learning in the recorded rollouts of fixed policies.
 
-A rule yields remarks; `RULES` has all rules by name.
+A rule yields a remark for each obstacle; `RULES` has all rules by name.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def stops(evidence: RolloutEvidence) -> Iterator[Remark]:
             seen.add(text)
             step = len(rollout.reward)
             message = f"the {rollout.policy} policy was stopped after {step} steps by {text}"
-            hint = getattr(rollout.error, "hint", None) or "correct the code that raises it, then lint again"
+            hint = getattr(rollout.error, "hint", None) or "correct the code that raises this error, then lint again"
             yield error_at(evidence.subject.location(rollout.error), message, hint, {"step": step})
 
 
@@ -58,7 +58,8 @@ def early_resets(evidence: RolloutEvidence) -> Iterator[Remark]:
         causes = Counter(cause for episode in early for cause in episode.causes)
         names = ", ".join(name for name, _ in causes.most_common(2)) or "a reset"
         message = f"{share:.0%} of the episodes end within {EARLY} steps, under every fixed policy"
-        hint = "choose start states that the termination allows (narrower reset ranges), or widen its limits"
+        hint = "choose start states that the termination allows (narrower reset ranges), or widen the termination's"
+        hint += " limits"
         yield error_at(f"terminations: {names}", message, hint, {"share": share, "steps": EARLY})
 
 
@@ -81,7 +82,7 @@ def silent_reward(evidence: RolloutEvidence) -> Iterator[Remark]:
         values = [rollout.terms[name] for rollout in evidence.rollouts if name in rollout.terms]
         if values and not any(bool(v.any()) for v in values):
             message = f"the term is 0 in all {steps} steps of {len(evidence.rollouts)} fixed policies"
-            hint = "check its thresholds, joints and sensors, give it a softer slope, or remove it"
+            hint = "check the term's thresholds, joints and sensors, give it a softer slope, or remove the term"
             yield warning_at(f"rewards.{name}", message, hint, {"steps": steps})
 
 
@@ -103,8 +104,8 @@ def dominant_reward(evidence: RolloutEvidence) -> Iterator[Remark]:
         if found and min(found) >= DOMINANT:
             others = ", ".join(other for other in active if other != name)
             message = f"the term is {min(found):.1%} or more of the absolute reward under every fixed policy"
-            message += f": {others} have no effect"
-            hint = "lower its weight, or raise the weights of the others"
+            message += f"; {others} have no effect"
+            hint = "lower the term's weight, or raise the weights of the other terms"
             yield warning_at(f"rewards.{name}", message, hint, {"share": min(found)})
 
 
@@ -118,7 +119,7 @@ def constant_reward(evidence: RolloutEvidence) -> Iterator[Remark]:
     if not ends_early or value == 0.0:  # with terminations, any other constant rewards long or short episodes
         reason = "" if ends_early else ", and no episode ends early"
         where = "rewards" if isinstance(evidence.rollouts[0].env, ManagedEnv) else "rew_buf"
-        message = f"the reward is {value:g} in every step of every fixed policy{reason}: there is nothing to learn"
+        message = f"the reward is {value:g} in every step of every fixed policy{reason}, so there is nothing to learn"
         yield error_at(where, message, "compute the reward from the state or the action", {"value": value})
 
 
@@ -151,7 +152,7 @@ def dying_pays(evidence: RolloutEvidence) -> Iterator[Remark]:
             return
         numbers["return_survived"] = _mean(timed_out)
         message += f"; the mean return of terminated episodes is {return_terminated:.3g}"
-        message += f", that of the others {_mean(timed_out):.3g}"
+        message += f", of other episodes {_mean(timed_out):.3g}"
     if good > 0.0:
         hint = "lower the terminal reward; if the episode ends at the goal, use --ignore dying-pays"
         yield warning_at("rewards", message, hint, numbers)
@@ -166,7 +167,7 @@ column is above 75 in 1 % of the steps."""
 
 
 def constant_observation(evidence: RolloutEvidence) -> Iterator[Remark]:
-    """Check that every observation column varies under the fixed policies; of a picture, at least one pixel."""
+    """Check that every observation column varies under the fixed policies; of an image, at least one pixel."""
     for where, values in _columns(evidence):
         if bool((values == values[:, :1]).all()):
             low = float(values.min())
@@ -186,7 +187,8 @@ def observation_scale(evidence: RolloutEvidence) -> Iterator[Remark]:
         if bool((values == values[:, :1]).all()) or (largest >= SMALL and usual <= LARGE):
             continue
         message = (
-            f"the observation is never larger than {largest:.3g}; below {SMALL:g} its effect is lost among the others"
+            f"the observation is never larger than {largest:.3g}; below {SMALL:g} a policy hardly notices it among"
+            " other observations"
         )
         if usual > LARGE:
             message = f"the observation is larger than {usual:.3g} in 1 % of the steps; policies learn"
@@ -201,7 +203,7 @@ def observation_scale(evidence: RolloutEvidence) -> Iterator[Remark]:
 def _angles_without_limits(env: VecEnv) -> set[str]:
     """Return the observation columns with angles of hinges without limits that are not wrapped to +-pi.
 
-    Such an angle grows by 2 pi in each turn. The columns are named as `observation_parts` names them.
+    Such an angle grows by 2 pi in each turn. The names are those of `observation_parts`.
     """
     found: set[str] = set()
     if not isinstance(env, ManagedEnv):
@@ -235,17 +237,17 @@ def _columns(evidence: RolloutEvidence) -> Iterator[tuple[str, Tensor]]:
 
 
 SATURATED = 0.8
-"""Fraction of the steps in which a quantity is at its limit, above which the rule reports the quantity."""
+"""Fraction of the steps from which on a quantity that is at its limit in so many steps is reported."""
 
 
 def saturated_actions(evidence: RolloutEvidence) -> Iterator[Remark]:
     """Check that random actions within the bound mostly stay within the limits of the actuators."""
     (rollout,) = [rollout for rollout in evidence.rollouts if rollout.policy == "random"]
-    hint = "lower the action's scale (or the gain), or raise the limit: actions beyond it have the same effect"
+    hint = "lower the action's scale (or the gain), or raise the limit: actions beyond the limit have the same effect"
     for name, share in rollout.limited.items():
         if share >= SATURATED:
             bound = evidence.subject.bound
-            message = f"it is at its limit in {share:.0%} of the steps under random actions within +-{bound:g}"
+            message = f"the value is at its limit in {share:.0%} of the steps under random actions within +-{bound:g}"
             yield warning_at(name, message, hint, {"share": share})
 
 
@@ -275,12 +277,15 @@ def dead_action(evidence: RolloutEvidence) -> Iterator[Remark]:
         if moved <= DEAD:
             message = f"the action moves nothing: after {steps} steps at +-{bound:g} the state differs by {moved:.1g}"
             message += " from the state without this action"
-            hint = "check its actuator, and that scale, gear and limit are not 0"
+            hint = "check the actuator of this column, and that scale, gear and limit are not 0"
             yield error_at(f"actions, column {column} ({name})", message, hint, {"moved": moved, "steps": steps})
 
 
 def _state_after(env: VecEnv, start: dict[str, Tensor], action: Tensor, steps: int) -> Tensor:
-    """Return positions and velocities after some steps with a constant action. (num_envs, nq + nv)"""
+    """Return positions and velocities after some steps with a constant action from `start`. (num_envs, nq + nv)
+
+    `start` is a result of `env.state_dict()`.
+    """
     env.load_state_dict(start)
     for _ in range(steps):
         env.step(action.clone())
@@ -309,8 +314,9 @@ def timestep(evidence: RolloutEvidence) -> Iterator[Remark]:
         env.step(FIXED_POLICIES["random"](env, evidence.subject.bound)(step))
     drift = energy_drift(env)
     if drift.relative > DRIFT:
-        message = f"after {drift.seconds:.2g} s without actuators the model's energy differs from that with steps of"
-        message += f" {dt / 2:g} s by {drift.relative:.0%} of the exchanged energy; up to {DRIFT:.0%} is usual"
+        message = f"after {drift.seconds:.2g} s without actuators the energy of the model differs from the energy with"
+        message += f" physics steps of {dt / 2:g} s by {drift.relative:.0%} of the energy exchanged between potential"
+        message += f" and kinetic; up to {DRIFT:.0%} is usual"
         yield warning_at(where, message, hint, {"energy_drift": drift.relative})
         return
     yield from _compare_half_and_double_step(evidence, dt, where, hint)
@@ -331,7 +337,7 @@ def _compare_half_and_double_step(evidence: RolloutEvidence, dt: float, where: s
             model = full.env.engine.model
             name = f"joint '{model.joint(int(model.dof_jntid[worst])).name}'"
             message = f"under random actions {name} moves at {float(a[worst]):.3g} (root mean square), and at"
-            message += f" {float(b[worst]):.3g} with steps of {dt / 2:g} s; a factor of up to {RATIO:g} is usual"
+            message += f" {float(b[worst]):.3g} with physics steps of {dt / 2:g} s; a factor up to {RATIO:g} is usual"
             yield warning_at(where, message, hint, {"ratio": float(ratio[worst])})
             return
     if 2 * dt > 0.1:
@@ -362,14 +368,14 @@ def horizon(evidence: RolloutEvidence) -> Iterator[Remark]:
             continue
         fitting = 1.0 - 1.0 / max(2.0, 0.25 * steps)
         message = f"this gamma gives a horizon of {ahead:.3g} steps ({ahead * resolved.task.step_dt:.2g} s)"
-        message += f", and an episode has {steps} ({resolved.task.episode_length_s:g} s)"
+        message += f", and an episode has {steps} steps ({resolved.task.episode_length_s:g} s)"
         numbers = {"gamma": gamma, "horizon": ahead, "episode": steps}
-        hint = f"{fitting:.3g} gives a horizon of a quarter of the episode"
+        hint = f"gamma = {fitting:.3g} gives a horizon of a quarter of the episode"
         yield warning_at(f"agents.{name}.gamma = {gamma:g}", message, hint, numbers)
 
 
 def discount_of(agent: AgentConfig | None) -> float | None:
-    """Return the discount factor in an agent's settings, also in nested ones; None if there is none."""
+    """Return the discount factor in an agent's settings, even if nested; None if the agent has none, or is None."""
     if agent is None:
         return None
     settings = sorted(leaves(agent.model_dump()), key=lambda leaf: len(leaf[0]))  # the least nested value comes first
@@ -382,7 +388,7 @@ _IN_ORDER: tuple[Callable[[RolloutEvidence], Iterable[Remark]], ...] = (
     *(observation_scale, saturated_actions, dead_action, timestep, horizon, degrees, joint_limits, start_pose_falls),
 )
 RULES = {rule.__name__.replace("_", "-"): rule for rule in _IN_ORDER}
-"""Name -> rule, in the order in which they run; `docs/guides/check-and-lint.md` lists them.
+"""Name -> rule, in the order in which the rules run; `docs/guides/check-and-lint.md` lists all rules.
 
 The first line of a rule's docstring is the rule."""
 

@@ -17,7 +17,7 @@ class Remark:
     severity: Literal["error", "warning"]
     """error: `rlcli lint` ends with exit code 9; warning: it does not, except with `--strict`."""
     where: str
-    """Term, column or setting."""
+    """Part of the task: a term, a column or a setting."""
     message: str
     """What was found."""
     hint: str

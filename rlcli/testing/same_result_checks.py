@@ -1,8 +1,8 @@
 """Checks of `rlcli check` that compare two trajectories of a task, and checks of its files and its speed.
 
-The results must be equal with other numbers of threads and of environments, on the GPU engine, and after a restore from
-a checkpoint. Further checks: the shipped policy fits the task, observation and action columns are as recorded in the
-task's file, and no Python loop runs over environments.
+The trajectories must be equal with other numbers of threads and of environments, on the GPU engine, and after a restore
+from a checkpoint. Further checks: the shipped policy fits the task, observation and action columns are as recorded in
+the task's file, and no Python loop runs over environments.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def threads(subject: TaskUnderTest) -> Iterator[Finding]:
 
 
 FEW = 3
-"""Number of environments of the smaller of two compared environments."""
+"""Smaller one of two numbers of environments whose trajectories are compared."""
 
 
 def num_envs(subject: TaskUnderTest) -> Iterator[Finding]:
@@ -110,7 +110,7 @@ def checkpoint(subject: TaskUnderTest) -> Iterator[Finding]:
         hint += " of the task"
     if unsaved := env.unsaved_state():
         hint = f"no checkpoint can hold {', '.join(unsaved)}; {hint}"
-    hint += "; else a resumed run differs from an uninterrupted one"
+    hint += "; else a resumed run differs from a run without interruption"
     yield from compare_trajectories(
         env, trajectories, "this output of the step differs after saving and restoring", hint
     )
@@ -125,7 +125,7 @@ def policy(subject: TaskUnderTest) -> Iterator[Finding]:
     """Check that the policy that the task ships can be read, and fits the task."""
     folder = subject.source.policy
     if folder is None:
-        raise NotRunError("the task ships no policy; `rlcli export --format bundle` writes one")
+        raise NotRunError("the task ships no policy; `rlcli export --format bundle` writes a policy to ship")
     try:
         bundle = open_bundle(folder)
         bundle.policy()
@@ -154,13 +154,15 @@ def layout(subject: TaskUnderTest) -> Iterator[Finding]:
     file = layout_file(subject)
     if not file.is_file():
         raise NotRunError(f"there is no {file.name}; `rlcli check TASK --record-layout` writes it")
-    hint = "undo the change; or record the new columns with --record-layout: policies that were trained with those in"
-    hint += f" {file.name} no longer fit"
+    hint = "undo the change; or record the new columns with `rlcli check TASK --record-layout`: policies that were"
+    hint += f" trained with the columns in {file.name} then no longer fit"
     try:
         recorded = _groups(json.loads(read_plain(file, JSON_LIMIT)))
     except (OSError, ValueError, KeyError, AttributeError, TypeError) as error:
         yield error_at(
-            file.name, f"the file has no record of the columns: {error!r}", "write it again: --record-layout"
+            file.name,
+            f"the file has no record of the columns: {error!r}",
+            "write the file again: rlcli check TASK --record-layout",
         )
         return
     current = _groups(json.loads(json.dumps(subject.env().layout.record())))
@@ -235,7 +237,7 @@ def speed(subject: TaskUnderTest) -> Iterator[Finding]:
 
 
 def _count_lines(env: VecEnv, action: Tensor) -> Counter[tuple[str, int]]:
-    """Count how often each line of Python runs in a step and a reset. Unlike times, counts are reproducible."""
+    """Return (file, line) -> how often the line runs in a step and a reset. Unlike times, counts are reproducible."""
     counts: Counter[tuple[str, int]] = Counter()
 
     def count(frame: FrameType, event: str, value: object) -> Any:
@@ -255,7 +257,7 @@ def _count_lines(env: VecEnv, action: Tensor) -> Counter[tuple[str, int]]:
 # --- the GPU engine ---
 
 FEW_WORLDS = 2
-"""Number of environments on the GPU engine, which MuJoCo Warp simulates slowly on a CPU."""
+"""Number of environments on the GPU engine; it is small, because MuJoCo Warp is slow on a CPU."""
 CLOSE = 1e-3
 """Largest accepted difference between the engines, relative to 1 + |value|."""
 
@@ -313,7 +315,7 @@ def captured(subject: TaskUnderTest) -> Iterator[Finding]:
 
 
 def _warp_env(subject: TaskUnderTest, decimation: int) -> VecEnv:
-    """Return a task's environment on the GPU engine (MuJoCo Warp), with two environments, on Warp's CPU device.
+    """Return two environments of a task on the GPU engine (MuJoCo Warp), which runs on Warp's CPU device.
 
     Args:
         subject: the task.

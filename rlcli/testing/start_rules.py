@@ -1,7 +1,4 @@
-"""Rule of the linter for start poses that fall although the actions are targets that should hold them.
-
-It is part of `rlcli lint`.
-"""
+"""Rule of `rlcli lint` for robots that fall from their start pose although zero actions should hold the pose."""
 
 from __future__ import annotations
 
@@ -14,11 +11,11 @@ from rlcli.testing.fixed_policy_rollouts import RolloutEvidence
 from rlcli.testing.remarks import Remark, warning_at
 
 _FALLS_WITHIN_S = 1.0
-"""Episodes of zero actions that end earlier [s] count as a fall from the start pose."""
+"""Time before which a terminated episode of zero actions counts as a fall from the start pose [s]."""
 
 
 def start_pose_falls(evidence: RolloutEvidence) -> Iterator[Remark]:
-    """Check that the start pose of a floating robot is held by zero actions, if they are targets of all its joints."""
+    """Check that zero actions hold the start pose of a floating robot, if they are position targets of all joints."""
     (rollout,) = [rollout for rollout in evidence.rollouts if rollout.policy == "zero"]
     env = rollout.env
     if not isinstance(env, ManagedEnv) or not _holds_the_default_pose(env):
@@ -37,7 +34,7 @@ def start_pose_falls(evidence: RolloutEvidence) -> Iterator[Remark]:
 
 
 def _holds_the_default_pose(env: ManagedEnv) -> bool:
-    """Return whether a robot floats, and zero actions are position targets of all its joints: their default values."""
+    """Return whether there is a floating robot, and zero actions command the default positions of all its joints."""
     targets = set()
     for term in env.layout.actions:
         config = env.config.actions[term.name]

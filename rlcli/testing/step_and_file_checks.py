@@ -43,7 +43,7 @@ def names(subject: TaskUnderTest) -> Iterator[Finding]:
             if unnamed:
                 places = [f"on '{e.target}'" if word == "actuator" else f"in '{e.parent.name}'" for e in unnamed]
                 message = f"{word} without a name: {listing(places)}; a term can select it only by its index"
-                hint = f'name it in the MJCF: <{word} name="..."/>'
+                hint = f'give the {word} a name in the MJCF: <{word} name="..."/>'
                 yield warning_at(f"scene.entities.{entity}: {config.model}", message, hint)
 
 
@@ -102,9 +102,9 @@ def dtypes(subject: TaskUnderTest) -> Iterable[Finding]:
 def _check_outputs(
     subject: TaskUnderTest, check: Callable[[str, Tensor, tuple[int, ...]], Iterator[Finding]]
 ) -> list[Finding]:
-    """Check the tensors that the task's own code returns; only if these are right, check the result of a step too.
+    """Check the tensors that the task's own code returns; only if they are right, check the result of a step, too.
 
-    A wrong tensor of the task would be found a second time in the result of the step.
+    A wrong tensor of the task would be reported a second time for the result of the step.
 
     Args:
         subject: the task.
@@ -200,9 +200,9 @@ def constant_columns(subject: TaskUnderTest) -> Iterator[Finding]:
 
 
 def _fixed_command_columns(env: VecEnv, group: str) -> set[str]:
-    """Return the observation columns that show a command whose range is a single number [x, x].
+    """Return the observation columns of a command whose range is a single number [x, x].
 
-    Such a column is constant on purpose. The columns are named as `observation_parts` names them.
+    Such a column is constant on purpose. The names are those of `observation_parts`.
     """
     found: set[str] = set()
     if not isinstance(env, ManagedEnv):
@@ -226,7 +226,7 @@ def aliasing(subject: TaskUnderTest) -> Iterator[Finding]:
     recording = subject.recording()
     for name, step in recording.late_writes.items():
         message = f"the tensor was changed in place at step {step}, while a trainer still uses it"
-        yield error_at(name, message, "write into a tensor of your own, or clone() first")
+        yield error_at(name, message, "write to a tensor that the task owns, or clone() the tensor first")
     for name, step in recording.shared.items():
         if name not in recording.late_writes:
             message = f"the tensor of step {step} shares its memory with the tensor of the step before"

@@ -1,4 +1,4 @@
-"""Helpers of the checks that step an environment: test actions, recorded trajectories, ended episodes."""
+"""Functions for checks that step an environment: test actions, recorded trajectories, ended episodes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ STEPS = 200
 
 @dataclass(slots=True)
 class Recording:
-    """Step results of an environment, with copies that show whether the tensors change later."""
+    """Step results of an environment, and which of their tensors were changed later."""
 
     env: VecEnv
     steps: list[StepResult] = field(default_factory=list)
@@ -27,8 +27,9 @@ class Recording:
     late_writes: dict[str, int] = field(default_factory=dict)
     """Name of an output that was changed in place during a later step -> index of the first such step."""
     shared: dict[str, int] = field(default_factory=dict)
-    """Name of an output whose tensor shares memory with the previous step's -> index of the first such step."""
+    """Name of an output whose tensor shares memory with that of the previous step -> index of the first such step."""
     error: Exception | None = None
+    """The error that ended the recording; None: no error."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,13 +38,13 @@ class EndedEpisode:
 
     env_id: int
     length: int
-    """Number of its steps."""
+    """Number of steps of the episode."""
     terminated: bool
     truncated: bool
     causes: tuple[str, ...]
-    """Names of the termination terms that ended it."""
+    """Names of the termination terms that ended the episode."""
     total: float = 0.0
-    """Undiscounted sum of its rewards."""
+    """Undiscounted sum of the rewards of the episode."""
 
 
 def ended_episodes(result: StepResult) -> list[EndedEpisode]:
@@ -60,7 +61,7 @@ def ended_episodes(result: StepResult) -> list[EndedEpisode]:
 
 
 def random_actions(env: VecEnv, bound: float, steps: int = STEPS) -> Iterator[Tensor]:
-    """Yield uniform actions within the bound. They follow from the environment's seed. (num_envs, a)"""
+    """Yield actions for `steps` steps, uniform in [-bound, bound], from the environment's seed. (num_envs, a) each"""
     generator = torch.Generator().manual_seed(env.seed)
     for _ in range(steps):
         yield (torch.rand(env.num_envs, env.layout.action_size, generator=generator) * 2.0 - 1.0) * bound
@@ -107,7 +108,7 @@ def record(env: VecEnv, actions: Iterator[Tensor]) -> Recording:
 
 
 def record_outputs(env: VecEnv, actions: Iterator[Tensor]) -> list[dict[str, Tensor]]:
-    """Return copies of all outputs of `reset(seed=env.seed)` and of the following steps."""
+    """Return copies of all outputs, by name, of `reset(seed=env.seed)` and of a step with each of the actions."""
     trajectory = [{f"observation '{group}'": value.clone() for group, value in env.reset(seed=env.seed).items()}]
     trajectory += [_copy(step_outputs(env.step(action))) for action in actions]
     return trajectory

@@ -1,6 +1,6 @@
-"""Class `TaskUnderTest`: a task with small seeded environments, and one recording that several checks share.
+"""Class `TaskUnderTest`, the form in which checks and linter get a task: few environments, seeded, on one thread.
 
-The checks and the linter get the task in this form.
+The class also has a recording of random actions that several checks share.
 """
 
 from __future__ import annotations
@@ -22,11 +22,14 @@ from rlcli.registry import TaskSource, find_task
 from rlcli.testing.steps import Recording, random_actions, record
 
 NUM_ENVS = 8
-"""Environments of a check, and the fewest that `--num-envs` allows."""
+"""Default number of environments of a check, and the smallest number that `--num-envs` allows."""
 
 
 class TaskUnderTest:
-    """Task as in training, but with few environments and one engine thread."""
+    """Task as in training, but with few environments and one engine thread.
+
+    The arguments are those of `check_task`. An invalid configuration raises `ConfigError`.
+    """
 
     def __init__(
         self,
@@ -70,7 +73,10 @@ class TaskUnderTest:
         return make_env(self._resolve(settings), seed=self.seed)
 
     def recording(self) -> Recording:
-        """Return 200 steps of random actions; only the first call raises the error that ended them, if there is one."""
+        """Return a recording of 200 steps of random actions, which the first call makes.
+
+        If an error ends the steps, the first call raises the error, and later calls return the steps before it.
+        """
         if self._recording is None:
             env = self.env()
             self._recording = record(env, random_actions(env, self.bound))
@@ -139,7 +145,7 @@ def task_of(env: VecEnv) -> DirectTask:
 
 
 def engine_state(env: VecEnv) -> dict[str, Tensor]:
-    """Return the tensors of the engine's state, such as positions and velocities, with one row per environment."""
+    """Return copies of the engine's state, such as positions and velocities, that have a row for each environment."""
     state = env.engine.state_dict()
     return {name: value for name, value in state.items() if value.dim() and len(value) == env.num_envs}
 
@@ -154,7 +160,7 @@ def column_names(env: VecEnv, group: str) -> list[str]:
 
 
 def element_names(elements: Sequence[str], size: int) -> list[str]:
-    """Return the names of a term's columns; their indices if the term does not have one name for each."""
+    """Return the names of a term's `size` columns; their indices if the term does not have one name for each column."""
     return list(elements) if len(elements) == size else [str(number) for number in range(size)]
 
 

@@ -1,6 +1,6 @@
-"""Measurement of the energy error of a physics time step, by comparison with half of that step.
+"""Measure the energy error of a physics time step, by comparison with a simulation with half the time step.
 
-The lint rule `timestep` reports steps that are too long.
+The rule `timestep` of `rlcli lint` reports time steps that are too long.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from rlcli.envs.vec_env import VecEnv
 PASSIVE_S = 1.0
 """Simulated time without actuators [s]."""
 MAX_STEPS = 1000
-"""Largest number of physics steps that the measurement takes."""
+"""Largest number of physics steps of a simulation."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +35,7 @@ def energy_drift(env: VecEnv, starts: int = 8) -> Drift:
 
     Args:
         env: the environments.
-        starts: largest number of start states; the result is their median.
+        starts: largest number of start states; the result is the median over the start states.
     """
     model, _ = env.world(0)
     dt = float(model.opt.timestep)
@@ -58,7 +58,7 @@ def _energy(model: mujoco.MjModel, start: mujoco.MjData, dt: float, steps: int, 
         start: the start state.
         dt: physics time step [s].
         steps: number of energies after the first one.
-        parts: number of physics steps between two of them.
+        parts: number of physics steps between two energies.
     """
     model = copy.copy(model)
     model.opt.timestep = dt
@@ -89,7 +89,7 @@ def _difference(coarse: np.ndarray, fine: np.ndarray) -> float:
 
     Args:
         coarse: potential and kinetic energy with the time step. (steps + 1, 2)
-        fine: the same with half of it.
+        fine: the same with half the time step.
     """
     if np.isnan(coarse).any():
         return np.inf

@@ -1,1 +1,1 @@
-"""Modules that run a training: setup, loop, checkpoints, evaluations, health checks, metric loggers and signals."""
+"""Run a training: setup, loop, checkpoints, evaluations, health checks, metric loggers and signals."""

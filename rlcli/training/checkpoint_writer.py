@@ -1,4 +1,4 @@
-"""Writer of checkpoints in a background thread, each completely or not at all; it also removes old checkpoints.
+"""Write checkpoints in a background thread, each completely or not at all, and remove old checkpoints.
 
 A "log" in this module is data of a trainer that only grows, such as a replay buffer. Its rows are written once, into
 files that all checkpoints share.
@@ -41,7 +41,7 @@ _NewRows = list[tuple[int, int, dict[str, Tensor]]]
 
 @dataclass(frozen=True, slots=True)
 class KeepRule:
-    """Rule for the checkpoints of a run to keep; the first, the best and the newest one are always kept."""
+    """Rule for the checkpoints of a run to keep; the first, the best and the newest checkpoint are always kept."""
 
     last: int | None = None
     """Number of newest checkpoints to keep; None: all."""
@@ -58,14 +58,16 @@ class KeepRule:
 
 
 class CheckpointWriter:
-    """Writer of a run's checkpoints in a background thread. Training waits only while the state is copied in memory.
+    """Writer of a run's checkpoints in a background thread, while the training goes on.
+
+    The training waits only while the state is copied in memory, and for a previous checkpoint that is not written yet.
 
     Args:
         checkpoints: the run's folder of checkpoints.
         keep: rule for the checkpoints to keep.
         manifest: entries of `manifest.json` that all checkpoints of the run share.
-        resumed: checkpoint from which training continues; rows that its files contain are not written again.
-        cases: recorder of failed episodes, which are written with each checkpoint.
+        resumed: checkpoint from which training continues, whose rows of logs are not written again; None: a new run.
+        cases: recorder of failed episodes, which are written with each checkpoint; None: they are not recorded.
     """
 
     def __init__(
@@ -91,14 +93,14 @@ class CheckpointWriter:
         self._failure: BaseException | None = None
 
     def is_due(self, iteration: int, save_interval: int | None) -> bool:
-        """Return whether a checkpoint is due after this iteration."""
+        """Return whether a checkpoint is due after an iteration, by `save_interval` or the rule's `every`."""
         return any(every and iteration % every == 0 for every in (save_interval, self._keep.every))
 
     def save(self, state: TrainerState, iteration: int, step: int) -> None:
         """Wait for the previous checkpoint, copy the state, and write the new checkpoint in the background.
 
         Raises:
-            MachineError: if the previous checkpoint could not be written.
+            MachineError: if the previous checkpoint could not be written, or the lock of the run is lost.
         """
         self.wait()  # first: the thread changes the list of written rows
         fresh = {name: self._copy_new(name, rows) for name, rows in state.logs.items()}
@@ -108,7 +110,7 @@ class CheckpointWriter:
         self._thread.start()
 
     def save_cases(self, iteration: int, step: int) -> None:
-        """Write the recorded failed episodes of an iteration that ended with an error, and so has no checkpoint."""
+        """Write the failed episodes of an iteration that ended with a divergence, and so gets no checkpoint."""
         if self.cases is not None:
             self.cases.commit(iteration, step)
             batch = self.cases.take(step)
@@ -130,7 +132,7 @@ class CheckpointWriter:
         require_lock(self.checkpoints)
 
     def check(self) -> None:
-        """Raise the error of the background thread, if it had one."""
+        """Raise the error of the background thread, if it had one; do not wait for the thread."""
         if self._failure is not None:
             self.wait()
 
@@ -208,7 +210,7 @@ def write_checkpoint(checkpoints: Path, step: int, state: TrainerState, extra: M
         extra: further entries of `manifest.json`.
 
     Raises:
-        MachineError: if the checkpoint cannot be written; no part of it is left.
+        MachineError: if the checkpoint cannot be written; no part of the checkpoint is left.
     """
     target = checkpoints / f"{step:012d}"
     if target.exists():
@@ -241,7 +243,7 @@ def write_checkpoint(checkpoints: Path, step: int, state: TrainerState, extra: M
 
 
 def prune(checkpoints: Path, keep: KeepRule, best: int | None) -> None:
-    """Remove the checkpoints that `keep` does not keep, and rows of logs (replay buffers) that only these need.
+    """Remove the checkpoints that `keep` does not keep, and rows of logs (replay buffers) that only they need.
 
     A checkpoint that cannot be removed stays complete.
 
@@ -263,10 +265,10 @@ def prune(checkpoints: Path, keep: KeepRule, best: int | None) -> None:
 
 
 def drop_after(checkpoints: Path, step: int) -> list[int]:
-    """Remove the checkpoints after the step at which training is resumed; return their steps.
+    """Remove the checkpoints after the environment step at which training is resumed; return their steps, ascending.
 
     A checkpoint that cannot be read is renamed to `STEP.unreadable` instead, and rows of logs (replay buffers) that
-    only this checkpoint needs are moved into its folder.
+    no other checkpoint needs are moved into its folder.
     """
     later = [saved for saved in steps(checkpoints) if saved > step]
     removed, aside = [], None
@@ -287,7 +289,10 @@ def drop_after(checkpoints: Path, step: int) -> list[int]:
 
 
 def drop_rows(checkpoints: Path, aside: Path | None = None) -> None:
-    """Remove the files with rows of logs (of a replay buffer) that no checkpoint needs, or move them to `aside`."""
+    """Remove the files with rows of logs (of a replay buffer) that no checkpoint needs, or move them to `aside`.
+
+    If a checkpoint cannot be read, no file is removed.
+    """
     files = set((checkpoints / LOG_FOLDER).glob("*/*.safetensors"))
     if not files:
         return
@@ -308,7 +313,7 @@ def drop_rows(checkpoints: Path, aside: Path | None = None) -> None:
 
 
 def remove_temporary_files(checkpoints: Path) -> None:
-    """Remove the temporary files that killed processes have left in the folder of a run."""
+    """Remove temporary files that killed processes have left in a run; `checkpoints` is the run's checkpoint folder."""
     for leftover in checkpoints.glob(".tmp-*"):
         shutil.rmtree(leftover, ignore_errors=True)
     run = checkpoints.parent

@@ -1,6 +1,6 @@
-"""Health checks of a training: they read its metrics and report what may prevent learning.
+"""Health checks of a training, which read its metrics and report what may prevent learning.
 
-The training loop runs them about 40 times; findings are logged and written into run.json.
+The training loop runs the checks about 40 times in a training; findings are logged and written into run.json.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from rlcli.rl.trainer_base import BaseTrainer
 
 RETURN, LENGTH, SUCCESS = "Train/mean_reward", "Train/mean_episode_length", "Train/success_rate"
 _GROUPS = ("Train/", "Eval/success", "Loss/", "Policy/", "Episode_", "Success", "Health/")
-"""First parts of the names of the metrics that the checks read."""
+"""Prefixes of the names of the metrics that the checks read."""
 _TIMES = 40
 """Number of times in a training at which the checks run."""
 _MIN_ITERATIONS = 8
@@ -30,8 +30,8 @@ _MIN_VALUES = 6
 _SOLVED = 0.3
 """Success rate above which only defects are reported, not signs of slow learning."""
 _MIN_GAPS, _SURE, _RARE = 4, 5.0, 0.02
-"""A lower reward in states of success is reported only after `_MIN_GAPS` comparisons, if it is lower by `_SURE`
-standard errors, and if the success rate has always been below `_RARE`."""
+"""A lower reward in states of success is reported only after `_MIN_GAPS` comparisons, if the difference is at least
+`_SURE` standard errors, and if the success rate has always been below `_RARE`."""
 _AT = 1e-3
 """Relative distance from a bound at which a value counts as at the bound."""
 
@@ -44,6 +44,7 @@ class Finding:
     """Problem that a health check found in a training, and that may prevent learning."""
 
     check: str
+    """Name of the check."""
     iteration: int
     """Iteration in which the check first failed."""
     message: str
@@ -53,12 +54,12 @@ class Finding:
 
 
 class Health:
-    """Health checks of one training. They run only about 40 times in a training, so they take almost no time.
+    """Health checks of one training.
 
     Args:
-        task: the task.
+        task: the task's configuration.
         agent: the agent's configuration.
-        iterations: iterations of the whole training.
+        iterations: number of iterations of the whole training.
     """
 
     def __init__(self, task: TaskConfig, agent: AgentConfig, iterations: int) -> None:
@@ -66,7 +67,7 @@ class Health:
         self.settings: dict[str, Any] = agent.model_dump()
         self.iteration = 0
         self.findings: list[Finding] = []
-        """Problems that the checks found both the last time and the time before."""
+        """Problems found both in the last run of the checks and in the run before; others are not reported."""
         self._series: dict[str, list[float]] = {}
         self._suspects: dict[str, Finding] = {}
 
@@ -76,7 +77,7 @@ class Health:
         return self.iteration / self.iterations
 
     def due(self, iteration: int) -> bool:
-        """Return whether the checks run after this iteration."""
+        """Return whether the checks run after an iteration, which is counted from 1."""
         every = max(1, self.iterations // _TIMES)
         return iteration >= _MIN_ITERATIONS and (iteration % every == 0 or iteration == self.iterations)
 
@@ -98,7 +99,7 @@ class Health:
         self._suspects = found
 
     def notes(self, metrics: Mapping[str, float]) -> list[str]:
-        """Return one line of text for each success condition of the task, with its value and its bound."""
+        """Return a line of text for each success condition in `metrics` (those of the newest iteration)."""
         lines = []
         ends = [
             f"Episode_Termination/{name}" for name, term in self.task.terminations.items() if term and term.time_out
@@ -133,9 +134,9 @@ class Health:
         return values[-max(3, len(values) // 8) :]
 
     def change(self, name: str) -> float:
-        """Return a metric's change since the start of the training, in units of its noise.
+        """Return a metric's change since the start of the training, in units of the metric's noise.
 
-        The noise is the spread of its values, but at least 10 % of the first value.
+        The noise is the standard deviation of the values, but at least 10 % of the mean of the first values.
         """
         before, after = self.first(name), self.last(name)
         if not before:
@@ -145,7 +146,7 @@ class Health:
         return (statistics.fmean(after) - statistics.fmean(before)) / noise
 
     def is_above_start(self) -> bool:
-        """Return whether the newest returns are far above the first one, also if they rose in the first iterations."""
+        """Return whether the newest returns are far above the first return, even if they rose only at the beginning."""
         start, after = self.first(RETURN)[0], self.last(RETURN)
         noise = max(statistics.pstdev(after), 0.1 * abs(start), 1e-9)
         return statistics.fmean(after) - start > 5.0 * noise
@@ -163,7 +164,7 @@ class Health:
 
 
 def probe(trainer: Trainer) -> dict[str, float]:
-    """Return the metrics `Health/*`: shares of the newest observations and actions that are constant or at a bound."""
+    """Return the metrics `Health/*`; empty with fewer than 2 observations, or if `trainer` is no `BaseTrainer`."""
     if not isinstance(trainer, BaseTrainer) or len(trainer.recent_obs) < 2:
         return {}
     found, begin, obs = {}, 0, trainer.recent_obs
@@ -221,7 +222,7 @@ def no_progress(health: Health) -> Found:
 def one_termination(health: Health) -> Found:
     """Report a termination that ends nearly all episodes, while episodes do not become longer.
 
-    Their lengths are compared with those at the start, or with those in the middle of the training.
+    The length of episodes is compared with that at the start, or in the middle of the training.
     """
     late = {name for name, term in health.task.terminations.items() if term is not None and term.time_out}
     complete = [v for n in late | {"time_out"} for v in _newer_half(health.values(f"Episode_Termination/{n}"))]
@@ -238,7 +239,7 @@ def one_termination(health: Health) -> Found:
 
 
 def _stalled(health: Health) -> bool:
-    """Return whether no episode has succeeded in half of the training, and episodes no longer get longer."""
+    """Return whether no episode has succeeded in half of the training, and episodes do not become longer any more."""
     successes, lengths = health.values(SUCCESS), health.values(LENGTH)
     return bool(successes) and health.struggles(0.5) and not any(successes) and not _approaches(lengths)
 
@@ -348,7 +349,7 @@ def actions_at_bound(health: Health) -> Found:
 
 
 def blocked_success(health: Health) -> Found:
-    """Report a success condition that blocks success: it holds much less often than the others, or no longer."""
+    """Report a success condition that blocks success: it holds much less often than the others, or does not hold."""
     for name, condition in health.task.success.items():
         held, values = health.median(f"Success/{name}"), health.values(f"Success_Value/{name}")
         if held is None or condition is None or not health.struggles(0.15):
@@ -369,7 +370,7 @@ def blocked_success(health: Health) -> Found:
             value = f"; its value is {statistics.fmean(values[-3:]):.3g}" if values else ""
             bound = f"; it must be {text}" if (text := bound_text(condition.model_dump())) else ""
             message = f"the condition '{name}' of success holds in {held:.1%} of the episodes{value}{bound}"
-            yield message, f"a larger reward for it, or another bound of success.{name}"
+            yield message, f"a larger reward for this condition, or another bound of success.{name}"
 
 
 def reward_without_success(health: Health) -> Found:
@@ -395,7 +396,8 @@ def reward_against_success(health: Health) -> Found:
     few = len(sizes) < _MIN_GAPS or max(health.values(SUCCESS), default=0.0) >= _RARE
     if few or not health.struggles(0.15) or statistics.median(sizes) > -_SURE or sizes[-1] > -_SURE:
         return
-    message = f"the reward of a step is lower in states of success than in others, by {-statistics.median(gaps):.3g}"
+    lower = -statistics.median(gaps)
+    message = f"the reward of a step is lower in states of success than in other states, by {lower:.3g}"
     yield message, "other signs or weights of the rewards, or a reward for success"
 
 
@@ -428,7 +430,7 @@ def _halved(gaps: list[float]) -> bool:
 
 
 def _approaches(values: list[float]) -> bool:
-    """Return whether the newest values are higher than those in the middle of the list; true for short lists."""
+    """Return whether the newest values are higher than the values in the middle of the list; true for short lists."""
     part, middle = max(3, len(values) // 8), len(values) // 2
     if len(values) < 4 * part:
         return True

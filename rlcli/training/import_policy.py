@@ -1,4 +1,4 @@
-"""Import of policies that Stable-Baselines3 or RSL-RL has saved, for `rlcli import`.
+"""Import policies that Stable-Baselines3 (SB3) or RSL-RL has saved, for `rlcli import`.
 
 The weights become a run with one checkpoint, which can be played, evaluated and exported.
 """
@@ -32,7 +32,7 @@ from rlcli.runs.untrusted_weights import VEC_NORMALIZE_HINT, read_archive_file, 
 from rlcli.training.checkpoint_writer import manifest_entries, write_checkpoint
 
 _NORMALIZER_EPS = 1e-2
-"""Number that RSL-RL adds to the standard deviation of observations before it divides by it."""
+"""Number that RSL-RL adds to the standard deviation of observations before dividing by the sum."""
 _MIN_STD = 1e-6
 """Smallest standard deviation of actions."""
 
@@ -42,11 +42,11 @@ class ImportedPolicy:
     """Policy of another library, converted to rlcli's format of saved policies."""
 
     spec: dict[str, Any]
-    """Content of `policy.json`."""
+    """Structure of the policy, the content of `policy.json`."""
     weights: dict[str, Tensor]
     """Weights by their names in a saved policy."""
     critic: dict[str, Tensor]
-    """Weights of the critics by their original names; empty: the file has none."""
+    """Weights of the critics by their original names; empty if the file has no critics."""
     algorithm: str
     """Algorithm of the training, derived from the names of the weights."""
 
@@ -60,7 +60,7 @@ def read_sb3(
         file: file that `model.save` has written; only its member `policy.pth` is read.
         activation: activation of the hidden layers, which the file does not contain; None: the library's default.
         action_bound: bound of the actions in the training, which were within +-action_bound.
-        normalizer: safetensors file with `mean` and `var` of VecNormalize.
+        normalizer: safetensors file with `mean` and `var` of VecNormalize; None: observations were not normalised.
 
     Raises:
         CheckpointError: if the file has another format, contains anything but tensors, or another kind of policy.
@@ -99,7 +99,7 @@ def read_sb3(
 
 
 def read_rsl_rl(file: Path, *, activation: str | None = None, action_bound: float | None = None) -> ImportedPolicy:
-    """Read a policy from a checkpoint of RSL-RL, with its LSTM and its observation normaliser if it has them.
+    """Read a policy from a checkpoint of RSL-RL, with its LSTM and observation normaliser if there are any.
 
     Args:
         file: `model_N.pt` of RSL-RL 2 or later.
@@ -144,9 +144,9 @@ def create_imported_run(
     Args:
         imported: the policy.
         resolved: configuration of the task and the agent.
-        record: further entries of run.json.
+        record: further entries of run.json; `imported` describes the file.
         runs_dir: the folder of runs.
-        name: text to add to the name of the run's folder; None: none.
+        name: text to add to the name of the run's folder; None: no text.
 
     Raises:
         CheckpointError: if the policy does not fit the task, with a table of the differences.
@@ -206,13 +206,14 @@ def _named_tensors(saved: object, where: str) -> dict[str, Tensor]:
         if value.layout != torch.strided or value.device.type != "cpu" or value.is_complex() or value.is_quantized:
             layout, dtype = (str(part).removeprefix("torch.") for part in (value.layout, value.dtype))
             found = f"'{name[:60]}' is a {layout} {dtype} tensor on {value.device}"
-            raise CheckpointError(f"{where}: {found}; save it as a dense, real CPU tensor")
+            raise CheckpointError(f"{where}: {found}; save a dense, real CPU tensor instead")
         # a stride of 0 makes a large tensor of few numbers: its copy would fill the memory
         if value.numel() * value.element_size() > value.untyped_storage().nbytes():
             raise CheckpointError(f"{where}: '{name[:60]}' is an expanded view; save a copy: tensor.clone()")
         total += 4 * value.numel()  # several tensors may share the numbers of the file
         if total > limit:
-            raise CheckpointError(f"{where} has over {limit:,} bytes, a quarter of the free memory; free some memory")
+            message = f"{where} has more than {limit:,} bytes, a quarter of the free memory"
+            raise CheckpointError(message, hint="end other programs, or give a smaller policy")
         named[name] = value.detach().to(torch.float32).clone(memory_format=torch.contiguous_format)
         if not bool(named[name].isfinite().all()):
             raise CheckpointError(f"{where}: '{name[:60]}' contains NaN or infinity; choose an older file")
@@ -254,7 +255,7 @@ def _mlp_policy(
         raise CheckpointError(f"{file} has no layers of a policy; choose another file")
     for (before, _), (after, _) in itertools.pairwise(layers):
         if after.shape[1] != len(before):
-            message = f"a layer with {len(before)} outputs is followed by one with {after.shape[1]} inputs"
+            message = f"a layer with {len(before)} outputs is followed by a layer with {after.shape[1]} inputs"
             raise CheckpointError(f"{file}: {message}; choose an undamaged file")
     spec = {
         "kind": kind,
@@ -275,13 +276,13 @@ def _log_std(weights: Mapping[str, Tensor], names: Mapping[str, str], file: Path
     if names["log_std"] in weights:
         return weights[names["log_std"]]
     if names["std"] not in weights:
-        message = f"{file}: the standard deviation depends on the state, which cannot be imported; train a constant one"
-        raise CheckpointError(message)
+        message = f"{file}: the policy's standard deviation depends on the state, which cannot be imported"
+        raise CheckpointError(f"{message}; train with a standard deviation that does not")
     return weights[names["std"]].clamp(min=_MIN_STD).log()
 
 
 def _lstm(weights: Mapping[str, Tensor], prefix: str, file: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Return (entries of `policy.json`, weights) of the LSTM in a file; both are empty if it has no LSTM.
+    """Return (entries of `policy.json`, weights) of the LSTM in a file; both are empty if the file has no LSTM.
 
     The names of the LSTM's weights begin with `prefix`.
     """
@@ -289,7 +290,7 @@ def _lstm(weights: Mapping[str, Tensor], prefix: str, file: Path) -> tuple[dict[
     for name, value in below(weights, prefix).items():
         kind, _, layer = name.rpartition("_l")
         if kind not in ("weight_ih", "weight_hh", "bias_ih", "bias_hh") or not (layer.isdecimal() and len(layer) < 3):
-            raise CheckpointError(f"{file}: {prefix}{name[:60]} is not of an LSTM; no other RNN can be imported")
+            raise CheckpointError(f"{file}: {prefix}{name[:60]} is no weight of an LSTM; other RNNs cannot be imported")
         lstm[f"memory.layers.{layer}.{kind}"] = value
     cells: list[int] = []
     while (recurrent := lstm.get(f"memory.layers.{len(cells)}.weight_hh")) is not None:
@@ -314,7 +315,7 @@ def _empirical_normalizer(stats: Mapping[str, Tensor], file: Path) -> dict[str, 
 
 
 def _normalizer(mean: Tensor, var: Tensor, stats: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return the tensors of rlcli's observation normaliser; its sample count is `count` of `stats`, else 0."""
+    """Return the tensors of rlcli's observation normaliser; the number of samples is `count` in `stats`, else 0."""
     count = stats.get("count", torch.zeros(())).double().reshape(-1)[:1].sum()
     return {"normalizer.mean": mean.double(), "normalizer.var": var.double(), "normalizer.count": count}
 
@@ -340,7 +341,11 @@ def _vec_normalize(file: Path) -> dict[str, Tensor]:
 def _checked_policy(
     file: Path, spec: dict[str, Any], weights: dict[str, Tensor], critic: dict[str, Tensor], algorithm: str
 ) -> ImportedPolicy:
-    """Return the imported policy after a check that it can be built."""
+    """Return the imported policy after a check that its structure is valid and its weights fit.
+
+    Raises:
+        CheckpointError: if they do not.
+    """
     try:
         policy = filled(blank_policy(spec), weights)
     except CheckpointError as error:

@@ -31,14 +31,14 @@ class Job:
     created: bool = True
     """Whether the run's folder was created for this job; False for a run that is resumed or was prepared before."""
     init_from: Path | None = None
-    """Folder of the checkpoint whose weights the policy starts with."""
+    """Folder of the checkpoint whose weights the policy starts with; None: random weights."""
     stages: list[int] = field(default_factory=list)
     """Iterations after which a checkpoint is saved; training ends after the last of these iterations. If the list is
     not empty, the agent's `max_iterations`, `max_steps`, `save_interval` and `keep_*` have no effect."""
     config: str | None = None
-    """New content of a resumed run's `config.yaml`, if its budget changes."""
+    """New content of a resumed run's `config.yaml`; None: the file stays, because the budget does not change."""
     video_every: int = 0
-    """Iterations between videos; 0: none."""
+    """Number of iterations between videos; 0: no videos."""
     writes: bool = True
     """Whether this process writes the run: True on rank 0."""
     begin: float = field(default_factory=time.monotonic)
@@ -66,13 +66,13 @@ class TrainingResult:
     step: int
     """Environment steps of the whole run."""
     iteration: int | None = None
-    """Iterations of the whole run. If the run was finished before, so that nothing was trained, this field and those
-    below are None."""
+    """Iterations of the whole run. If the run was already finished, so that nothing was trained, this field is None,
+    and the following ones have their defaults."""
     elapsed_s: float | None = None
     """Duration of this training [s]."""
     seed: int | None = None
     new_steps: int | None = None
-    """Environment steps of this training; for a resumed run, without those before."""
+    """Environment steps of this training; for a resumed run, without the steps before the resumption."""
     metrics: dict[str, float] = field(default_factory=dict)
     """Metrics of the last iteration."""
     state: str = "finished"

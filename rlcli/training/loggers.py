@@ -1,6 +1,7 @@
-"""Loggers, which write the metrics of each iteration of a training.
+"""Loggers, which write the metrics of each iteration of a training to files.
 
-`metrics.jsonl` is always written, TensorBoard if it is installed, experiment trackers if the user names them.
+`metrics.jsonl` is always written, TensorBoard files if TensorBoard is installed. Experiment trackers, which the user
+must name, are in `rlcli.training.trackers`.
 """
 
 from __future__ import annotations
@@ -50,11 +51,11 @@ LOGGERS = {
 
 
 class JsonLines:
-    """Logger that writes one JSON object per iteration into `metrics.jsonl`, and flushes it at once.
+    """Logger that writes one JSON object per iteration into `metrics.jsonl`, and flushes the file at once.
 
     Args:
         file: the file.
-        resume_after: iteration at which the run is resumed; later rows are removed.
+        resume_after: iteration at which the run is resumed, after which rows are removed; None: a new run.
     """
 
     def __init__(self, file: Path, *, resume_after: int | None = None) -> None:
@@ -81,7 +82,8 @@ class TensorBoard:
 
     Args:
         folder: folder of the files.
-        resume_after_step: environment steps at which the run is resumed; events of later steps are removed.
+        resume_after_step: environment steps at which the run is resumed, after which events are removed; None: a new
+            run.
     """
 
     def __init__(self, folder: Path, *, resume_after_step: int | None = None) -> None:
@@ -119,7 +121,10 @@ class TensorBoard:
 
 
 def check_loggers(names: Sequence[str] | None) -> list[str]:
-    """Return the loggers to use; by default TensorBoard if it is installed.
+    """Return the names of the loggers to use, after a check that they are installed.
+
+    Args:
+        names: values of `--logger`, of which `none` means no logger; None or empty: TensorBoard if it is installed.
 
     Raises:
         UsageError: if a name is not a logger.

@@ -35,9 +35,10 @@ _log = logging.getLogger(__name__)
 SAVE_EVERY_S = 60.0
 """Time between checkpoints without a `save_interval` [s]."""
 LONG_S = 0.1
-"""Duration of an iteration above which the next can be interrupted: the state before it is copied [s]."""
+"""Duration of an iteration [s] above which a signal can interrupt the next iteration, before which the state is copied.
+"""
 RECENT = 100
-"""Number of iterations whose mean duration gives the time left."""
+"""Number of newest iterations from whose mean duration the remaining time is estimated."""
 DIVERGED_SHARE = 0.01
 """Fraction of an iteration's environment steps that may diverge; above it the training stops."""
 
@@ -57,8 +58,11 @@ class TrainLoop:
     save_interval: int | None = None
     """Number of iterations between checkpoints; None: a checkpoint every `SAVE_EVERY_S` seconds."""
     periodic_eval: PeriodicEval | None = None
+    """Evaluation every few iterations; None: no evaluations."""
     videos: TrainingVideos | None = None
+    """Recorder of videos every few iterations; None: no videos."""
     health: Health | None = None
+    """Health checks; None: no checks."""
     show: Callable[[Progress], None] = lambda _: None
     """Function that displays the progress after each iteration."""
     count_divergences: Callable[[], int] = lambda: 0
@@ -85,7 +89,7 @@ class TrainLoop:
         """Train until the budget is spent, the threshold of `--until` is reached or the deadline has passed.
 
         Raises:
-            Stopped: on a signal, after a checkpoint between two iterations is written; on a second signal at once.
+            Stopped: on a signal, after a checkpoint between two iterations is written; on a second signal, at once.
             DivergedError: if the learner or too many environment steps diverge; the last good checkpoint is kept.
             MachineError: if the run cannot be written.
         """
@@ -163,8 +167,8 @@ class TrainLoop:
         """Do one iteration and, if it is due, an evaluation.
 
         Returns:
-            The trainer's report; the metrics of the evaluation, empty without one; whether it is the best evaluation so
-            far (on the rank that evaluates); whether all ranks must save a checkpoint.
+            The trainer's report; the metrics of the evaluation, empty if there was none; whether the evaluation is the
+            best so far (on the rank that evaluates); whether all ranks must save a checkpoint.
 
         Raises:
             DivergedError: if too many environment steps diverged.
@@ -191,10 +195,11 @@ class TrainLoop:
 
     @contextlib.contextmanager
     def _interruptible(self, is_long: bool) -> Iterator[None]:
-        """Allow a signal to end a long iteration in the middle: copy the trainer's state before it, to save that state.
+        """Allow a signal to end a long iteration, which the `with` block does, in the middle.
 
-        A divergence in a long iteration also saves that state. A short iteration is always finished, because that takes
-        less time than copying the state. On a GPU and with several ranks every iteration is finished.
+        The trainer's state is copied before the iteration; after a signal or a divergence, this state is saved. A short
+        iteration is always finished, because that takes less time than copying the state. On a GPU and with several
+        ranks every iteration is finished.
         """
         self._boundary = self.trainer.iteration, self.trainer.env_steps
         interruptible = self.stop.can_interrupt and self._ranks.world_size == 1
@@ -243,7 +248,10 @@ class TrainLoop:
 
 
 def _with_rates(report: Report, steps: int) -> dict[str, float]:
-    """Return the metrics of an iteration of `steps` environment steps, with its speed and durations as `Perf/*`."""
+    """Return the metrics in a report, with the iteration's speed and durations as `Perf/*`.
+
+    `steps` is the number of environment steps of the iteration.
+    """
     seconds = report.seconds
     total = max(sum(seconds.values()), 1e-9)
     rates = {
@@ -256,7 +264,9 @@ def _with_rates(report: Report, steps: int) -> dict[str, float]:
 
 
 def _require_stable(diverged: float, trainer: Trainer) -> None:
-    """Check that at most the share `DIVERGED_SHARE` of the iteration's environment steps has diverged.
+    """Check that at most the share `DIVERGED_SHARE` of an iteration's environment steps has diverged.
+
+    `diverged` is the number of diverged steps in the newest iteration, over all ranks.
 
     Raises:
         DivergedError: if more steps have diverged.

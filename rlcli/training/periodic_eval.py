@@ -1,6 +1,6 @@
-"""Evaluation of the policy every few iterations of a training.
+"""Evaluate the policy every few iterations of a training.
 
-The checkpoint with the best score is RUN@best; a threshold (`--until`) can end the training.
+The checkpoint with the best evaluation is RUN@best; a threshold (`--until`) can end the training.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ class PeriodicEval:
         make_env: function that builds the environment; it is called at the first evaluation.
         episodes: number of episodes of an evaluation.
         interval: number of iterations between evaluations.
-        history: metrics of the previous iterations; an iteration without an evaluation is ignored.
-        until: threshold at which the training ends; None: only its budget ends it.
+        history: rows of `metrics.jsonl` of the iterations before a resumption; rows without an evaluation are ignored.
+        until: threshold at which the training ends; None: only the budget ends the training.
     """
 
     def __init__(
@@ -51,17 +51,17 @@ class PeriodicEval:
         best = max(history, key=_score, default={})  # if several iterations have the best score, the first one counts
         self._best = _score(best)
         self.best: int | None = best["step"] if self._best > _score({}) else None
-        """Environment steps of the best iteration in the history; None: it has no evaluation."""
+        """Environment steps of the best evaluation in the history; None: the history has no evaluation."""
 
     def due(self, iteration: int) -> bool:
-        """Return whether an evaluation is due after this iteration."""
+        """Return whether an evaluation is due after an iteration, which is counted from 1."""
         return iteration % self._interval == 0
 
     def run(self, policy: Callable[[], Policy]) -> dict[str, float]:
         """Evaluate the policy that `policy()` returns; return the metrics `Eval/*`.
 
-        The random generators are saved before `policy()` is called, because it draws initial weights, and are restored
-        at the end.
+        The random generators are saved before `policy()` is called, because that call draws random weights, and are
+        restored at the end.
         """
         with undisturbed():
             if self._env is None:
@@ -79,7 +79,11 @@ class PeriodicEval:
         return {**metrics, _SUCCESS: summary["success"]["rate"]} if "success" in summary else metrics
 
     def improves(self, metrics: Mapping[str, float]) -> bool:
-        """Record an evaluation's score (success rate, then return); return whether it is the best so far."""
+        """Return whether an evaluation is the best so far, and remember its score.
+
+        Evaluations are compared by their success rate, and if these are equal or missing, by their mean return.
+        `metrics` is the result of `run`.
+        """
         better = _score(metrics) > self._best
         self._best = max(self._best, _score(metrics))
         return better
@@ -91,7 +95,10 @@ def _score(metrics: Mapping[str, Any]) -> tuple[float, float]:
 
 
 def _text(summary: Mapping[str, Any], until: Threshold | None) -> str:
-    """Return the result of an evaluation as text: success, else return, and the value that `until` compares."""
+    """Return the result of an evaluation as text for the user, with the number that `until` compares.
+
+    The text has the metric of `until`, or without a threshold the success rate, or else the mean return.
+    """
     key = until.key if until is not None and until.key in summary else "success" if "success" in summary else "return"
     value, low = (summary[key][name] for name in ("rate" if key == "success" else "mean", "low"))
     text = f"{key} {value:.1%}" if key == "success" else f"{key} {value:.4g}"

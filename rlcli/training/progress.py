@@ -1,4 +1,4 @@
-"""Data class with the progress of a training (iteration, speed, time left), for display by `train` and `watch`.
+"""Progress of a training (iteration, speed, remaining time), for display by `rlcli train` and `rlcli watch`.
 
 The module imports neither torch nor MuJoCo.
 """
@@ -14,7 +14,7 @@ PARTS = ("physics", "task", "policy", "update")
 """Parts of an iteration whose durations are measured."""
 _RETURN = "Train/mean_reward"
 _FOREVER_S = 1e10
-"""Largest remaining time that is displayed [s]; a longer one counts as unknown."""
+"""Largest remaining time that is displayed [s]; a longer time counts as unknown."""
 
 
 @dataclass(slots=True)
@@ -32,7 +32,7 @@ class Progress:
     """Part of an iteration -> its duration [s], or its share of the iteration."""
     metrics: dict[str, float]
     no_episode: str = ""
-    """Note that no episode has ended in the newest iterations, so `Train/*` are of older episodes; empty if one has."""
+    """Note that no episode has ended in the newest iterations, so that `Train/*` are of older episodes; else empty."""
     may_end_earlier: bool = False
     """Whether the training may end before its budget, because of a threshold (`--until`)."""
     notes: Sequence[str] = ()
@@ -42,7 +42,7 @@ class Progress:
 def progress_from_metrics(rows: Sequence[Mapping[str, Any]], iterations: int | None) -> Progress:
     """Return the progress of a run from the newest rows of its `metrics.jsonl`.
 
-    The speed is the mean over all rows but the oldest: the first iteration of a training also compiles and warms up.
+    The speed is the mean over all rows except the oldest, because the first iteration of a training compiles code.
 
     Args:
         rows: the rows, at least one, oldest first.
@@ -64,7 +64,7 @@ def progress_from_metrics(rows: Sequence[Mapping[str, Any]], iterations: int | N
 
 
 def no_episode_note(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Return a note if no episode has ended in the newest iterations; empty if one has ended in the last.
+    """Return a note if no episode has ended in the newest iterations; an empty text if one ended in the last one.
 
     An iteration in which episodes have ended has metrics `Episode_*`; without them, `Train/*` repeat older values.
 
@@ -76,12 +76,12 @@ def no_episode_note(rows: Sequence[Mapping[str, Any]]) -> str:
     newest = itertools.takewhile(lambda row: not any(name.startswith("Episode_") for name in row), reversed(rows))
     count = sum(1 for row in newest if row.get(_RETURN) == rows[-1][_RETURN])
     least = "at least " if count == len(rows) else ""
-    text = f"no episode ended for {least}{count} iteration{'s' * (count != 1)}, so the figures are older"
+    text = f"no episode ended for {least}{count} iteration{'s' * (count != 1)}, so the figures are of older episodes"
     return text if count else ""
 
 
 def _iteration_s(row: Mapping[str, Any]) -> float:
-    """Return the duration of an iteration; older runs did not measure the time of videos and checkpoints."""
+    """Return the duration of an iteration [s]; for runs of older versions, without videos and checkpoints."""
     measured = _number(row, "Perf/iteration_time")
     return measured or _number(row, "Perf/collection_time") + _number(row, "Perf/learning_time")
 

@@ -1,6 +1,6 @@
 """Function `run_training`, which runs a prepared training to its end.
 
-It opens loggers and checkpoints, runs the training loop, and records in run.json how the training ended.
+The function opens loggers and checkpoints, runs the training loop, and records in run.json how the training ended.
 """
 
 from __future__ import annotations
@@ -60,11 +60,14 @@ def run_training(
         job: run and settings of the training; the run is unlocked at the end.
         trainer: the trainer, in the state in which training starts.
         env: the trainer's environment; it is closed at the end.
-        stop: stop request of a signal.
+        stop: stores whether a signal has asked the training to stop.
         view: display of the progress.
 
     Returns:
         The result; None on a rank that does not write the run.
+
+    Raises:
+        Stopped, DivergedError, MachineError: see `TrainLoop.train`.
     """
     run, resolved = job.run, job.resolved
     _log.debug("environment and trainer built in %.1f s", time.monotonic() - job.begin)
@@ -146,7 +149,7 @@ def _train(job: Job, trainer: Trainer, env: Environment, stop: StopRequest, view
     is_done = loop.reached or budgets[-1].spent(trainer)
     close("finished" if is_done else "stopped")
     if not is_done:
-        again = f"rlcli train --resume {shlex.quote(str(run.shown))} continues it"
+        again = f"rlcli train --resume {shlex.quote(str(run.shown))} continues the training"
         _log.info(f"stopped after {agent.max_minutes:g} minutes, in iteration {trainer.iteration}; {again}")
     if job.writes and agent.until is not None:
         _report_bar(run, agent.until, loop.reached)
@@ -159,7 +162,7 @@ def _train(job: Job, trainer: Trainer, env: Environment, stop: StopRequest, view
 
 
 def _open_writer(job: Job, env: Environment) -> CheckpointWriter:
-    """Open the writer of checkpoints and the recorder of failed episodes."""
+    """Return the writer of checkpoints, with the recorder of failed episodes."""
     run, (agent, _) = job.run, job.resolved.require_agent()
     manifest = manifest_entries(run, agent.trainer, env.layout, describe(env.local))
     keep = KeepRule() if job.stages else KeepRule.from_settings(agent.keep_last, agent.keep_every, agent.save_interval)
@@ -176,8 +179,8 @@ def _record_begin(job: Job, trainer: Trainer, env: Environment, budget: Budget) 
     if unsaved:
         names = ", ".join(unsaved)
         _log.warning(
-            f"a resumed run may differ from an uninterrupted one: no checkpoint can store {names}; keep the"
-            " state of the task in numbers, containers, tensors or generators of random numbers"
+            f"a resumed run may differ from a run without interruption, because no checkpoint can store {names}; keep"
+            " the state of the task in numbers, containers, tensors or random generators"
         )
     exact = not unsaved and env.device.type == "cpu"
     job.run.update(state="running", since=datetime.now(UTC).isoformat(), iterations=budget.iterations(trainer))
@@ -187,8 +190,8 @@ def _record_begin(job: Job, trainer: Trainer, env: Environment, budget: Budget) 
 def _provenance(job: Job, trainer: Trainer, env: Environment) -> dict[str, Any]:
     """Return the entries of run.json that describe machine, versions and compiled model.
 
-    For a resumed run, return the entry `resumed` with the changes of these since the run was created; an empty mapping
-    if nothing has changed.
+    For a resumed run, return only the entry `resumed` with the changes since the run was created; an empty dict if
+    nothing has changed.
     """
     record, device = job.run.record, str(env.device)
     built = built_record(env.engine.model, device)
@@ -209,11 +212,11 @@ def _provenance(job: Job, trainer: Trainer, env: Environment) -> dict[str, Any]:
 
 
 def _make_play_env(job: Job, purpose: str, flags: dict[str, Any]) -> VecEnv:
-    """Make an environment of the job's task in play mode, with its own seed.
+    """Return environments of the job's task in play mode (with the task's `play:` changes), with a seed of their own.
 
     Args:
         job: run and settings of the training.
-        purpose: purpose of the environment (`evaluation`, `video`), from which its seed is derived.
+        purpose: purpose of the environments (`evaluation`, `video`), from which their seed is derived.
         flags: dotted key -> value of further settings.
     """
     resolved = resolve_run(job.run, play=True, flags=flags, named=job.resolved.source)
@@ -221,7 +224,7 @@ def _make_play_env(job: Job, purpose: str, flags: dict[str, Any]) -> VecEnv:
 
 
 def _periodic_eval(job: Job, writer: CheckpointWriter, stop: StopRequest, iterations: int) -> PeriodicEval | None:
-    """Return the evaluation between iterations, if the agent has one; None on other ranks than 0."""
+    """Return the evaluation every few iterations; None if the agent sets none, and on ranks other than 0."""
     run, (agent, _) = job.run, job.resolved.require_agent()
     until = None if agent.until is None else read_threshold(agent.until)
     if (agent.eval_interval is None and until is None) or not job.writes:
@@ -244,7 +247,7 @@ def _periodic_eval(job: Job, writer: CheckpointWriter, stop: StopRequest, iterat
 
 
 def _health(job: Job, iterations: int) -> Health | None:
-    """Return the health checks, with the metrics of a resumed run's earlier iterations; None on other ranks than 0."""
+    """Return the health checks, with the metrics of a resumed run's earlier iterations; None on ranks other than 0."""
     if not job.writes:
         return None
     agent, _ = job.resolved.require_agent()
@@ -262,12 +265,12 @@ def _report_bar(run: Run, bar: str, reached: bool) -> None:
     if reached:
         _log.info(f"{bar} reached after {step:,} steps and {seconds:.1f} s of rollouts and updates")
     else:
-        why = "the lower end of the 95 % interval did not reach it in any evaluation"
+        why = "in no evaluation was the lower end of the 95 % interval that high"
         _log.warning(f"{bar} was not reached in {step:,} steps: {why}")
 
 
 def _training_videos(job: Job, stop: StopRequest) -> TrainingVideos | None:
-    """Return the recorder of videos; None without `--video-every`, and on other ranks than 0."""
+    """Return the recorder of videos; None without `--video-every`, and on ranks other than 0."""
     if not job.video_every or not job.writes:
         return None
     # imported here: most trainings do not need OpenGL and the video modules

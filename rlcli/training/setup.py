@@ -1,7 +1,4 @@
-"""Setup of a training: it builds the environment and the trainer of a job.
-
-For a resumed run it also loads the checkpoint.
-"""
+"""Build the environment and the trainer of a training; for a resumed run, load the checkpoint."""
 
 from __future__ import annotations
 
@@ -28,12 +25,13 @@ _log = logging.getLogger(__name__)
 
 
 def build_trainer(job: Job, device: str) -> tuple[Trainer, Environment]:
-    """Build the trainer and its environment; load the checkpoint to resume from, if there is one.
+    """Return the trainer and its environment, in the state in which training starts.
 
-    If the budget of a resumed run changes, its `config.yaml` is written last, after all operations that may fail.
+    A resumed run gets the state of its checkpoint. If its budget changes, `config.yaml` is written last, after all
+    operations that may fail.
 
     Raises:
-        CheckpointError: if a checkpoint does not fit.
+        CheckpointError: if a checkpoint is corrupt, or does not fit the task or the agent.
     """
     resolved, record, saved = job.resolved, job.run.record, job.resume_from
     agent, _ = resolved.require_agent()
@@ -60,7 +58,10 @@ def build_trainer(job: Job, device: str) -> tuple[Trainer, Environment]:
 
 
 def make_trainer(resolved: Resolved, seed: int, device: str, torch_threads: int) -> tuple[Trainer, Environment]:
-    """Make the environment and the trainer of a configuration; each rank derives its own seeds from `seed`."""
+    """Return a new trainer and environment for a configuration; each rank derives its own seeds from `seed`.
+
+    `torch_threads` is the number of threads of torch in the update.
+    """
     agent, spec = resolved.require_agent()
     ranks = distributed.current()
     seed_generators(ranks.seed(derive(seed, "task"), "task"))  # a task may draw random numbers while it is built
@@ -74,7 +75,11 @@ def make_trainer(resolved: Resolved, seed: int, device: str, torch_threads: int)
 
 
 def _load_state(saved: Checkpoint, state: TrainerState, trainer: Trainer, env: Environment) -> None:
-    """Load the state of a checkpoint into the trainer and its environment, to resume a training."""
+    """Load the state of a checkpoint into the trainer and its environment, to resume a training.
+
+    Raises:
+        CheckpointError: if the state does not fit.
+    """
     require_fit(saved, env.layout)
     _load(saved, lambda: trainer.load(state), "the run cannot be resumed", hint="choose another checkpoint: RUN@step:N")
     if (trainer.iteration, trainer.env_steps) != (saved.iteration, saved.step):
@@ -87,7 +92,10 @@ def _load_state(saved: Checkpoint, state: TrainerState, trainer: Trainer, env: E
 
 
 def _load(saved: Checkpoint, load: Callable[[], Any], failure: str, hint: str | None = None) -> None:
-    """Call a loader of a checkpoint's data; raise any of its errors as a CheckpointError that begins with `failure`."""
+    """Call `load`, which loads data of a checkpoint; turn its errors into a CheckpointError with the text `failure`.
+
+    An error of rlcli is raised unchanged.
+    """
     try:
         load()
     except RlcliError:

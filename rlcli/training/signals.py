@@ -1,6 +1,6 @@
-"""Signals (Ctrl-C, SIGTERM) that stop a training: the first stops it with a checkpoint, the second at once.
+"""Signals (Ctrl-C, SIGTERM) that stop a training: the first signal after a checkpoint, a second signal at once.
 
-Commands that train use `StopRequest`, a context manager.
+Commands that train use the context manager `StopRequest`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ terminal that closes. Windows has only some of these signals."""
 
 
 class Interrupted(KeyboardInterrupt):
-    """Exception that ends an iteration after a signal. A resumed run repeats this iteration; earlier ones are kept."""
+    """Exception that ends an iteration after a signal; a resumed run repeats this iteration."""
 
 
 @dataclass(slots=True)
@@ -59,10 +59,10 @@ class StopRequest(StepObserver):
 
     @contextlib.contextmanager
     def before_training(self, interruptible: bool = True) -> Iterator[None]:
-        """Stop at the first signal: inside the `with` block, which prepares a training, or at its end.
+        """Stop at the first signal inside the `with` block, which prepares a training, or at the end of the block.
 
         Args:
-            interruptible: stop inside the block; otherwise at its end.
+            interruptible: whether a signal stops the block in the middle; false: at its end.
 
         Raises:
             Stopped: on a signal.
@@ -79,7 +79,7 @@ class StopRequest(StepObserver):
             raise Stopped("stopped before training began", exit_code=self.exit_code) from None
 
     def before_step(self) -> None:
-        """Check for a signal before every environment step, because a task's code may have caught `Interrupted`."""
+        """Raise `Interrupted` again before the next step, in case a task's code has caught the exception."""
         self.check()
 
     def check(self) -> None:

@@ -1,6 +1,6 @@
-"""Start of a training: the run is created or resumed, and the job (run and settings) is made.
+"""Start a training: create or resume its run, and return the `Job` (the run and its settings).
 
-With several processes (ranks), rank 0 does this and broadcasts the job to the others.
+With several processes (ranks), rank 0 does this and broadcasts the job to the other ranks.
 """
 
 from __future__ import annotations
@@ -41,27 +41,28 @@ class TrainingRequest:
     runs: Path
     """Folder of all runs."""
     source: TaskSource | None = None
-    """The task; it may be None for a run to resume."""
+    """The task; may be None if a run is resumed."""
     resume: str | None = None
-    """Reference of the run to resume."""
+    """Reference of the run to resume; None: a new run."""
     agent: str | None = None
     device: str = "auto"
     gpus: int | None = None
-    """Number of processes to start on this machine, with one GPU each."""
+    """Number of processes to start on this machine, with one GPU each; None: not given."""
     config: Path | None = None
     overrides: list[str] = field(default_factory=list)
     flags: dict[str, Any] = field(default_factory=dict)
     """Dotted key -> value of settings that options such as `--num-envs` set."""
     budget: dict[str, Any] = field(default_factory=dict)
-    """Dotted key -> value of the budget; empty: the agent's own."""
+    """Dotted key -> value of the budget (`agent.max_iterations` and so on); empty: the agent's own budget."""
     seed: int = 42
     loggers: list[str] | None = None
+    """Names of loggers; None: the user's setting, else TensorBoard if it is installed."""
     init_from: str | None = None
-    """Reference of the checkpoint whose weights a new run starts with."""
+    """Reference of the checkpoint whose weights a new run starts with; None: random weights."""
     video_every: int | None = None
-    """Iterations between videos; 0: none."""
+    """Number of iterations between videos; 0: no videos; None: as before for a resumed run, else no videos."""
     name: str | None = None
-    """Text to add to the name of a new run's folder."""
+    """Text to add to the name of a new run's folder; None: no text."""
 
     def resolve(self, changes: Sequence[str] = ()) -> tuple[Resolved, str]:
         """Return the configuration and the device of a new run.
@@ -123,7 +124,12 @@ def broadcast_job(request: TrainingRequest, resolved: Resolved | None, device: s
 
 
 def new_run(request: TrainingRequest, resolved: Resolved, device: str) -> Job:
-    """Create a run with its folder, before torch and MuJoCo are imported; return the job."""
+    """Create and lock a run, without importing torch and MuJoCo; return the job.
+
+    Raises:
+        CheckpointError, DependencyError: see `run_record`.
+        MachineError: if the folder cannot be written.
+    """
     record = run_record(request, resolved, device)
     config = to_yaml(to_data(resolved))
     run = create_run(request.runs, resolved.source.name, request.name, config, record)
@@ -133,7 +139,9 @@ def new_run(request: TrainingRequest, resolved: Resolved, device: str) -> Job:
 
 
 def prepare_run(folder: Path, request: TrainingRequest, changes: Sequence[str] = ()) -> str:
-    """Create a run in the state `waiting` in a given folder, if it does not exist yet; return its device.
+    """Create a run in the state `waiting` in a folder, if the folder has no run yet; return the run's device.
+
+    `changes` are overrides (`KEY=VALUE`) in addition to those of the request.
 
     Raises:
         UsageError: if the folder contains a run with other settings.
@@ -184,9 +192,15 @@ def run_record(request: TrainingRequest, resolved: Resolved, device: str) -> dic
 
 
 def resume_run(request: TrainingRequest) -> Job | TrainingResult:
-    """Open and lock a run to continue it; if it is finished and has no new budget, return its result instead.
+    """Open and lock a run, and return the job that continues the run.
 
-    A finished run that has lost its last checkpoints is continued, if the reference names the run as a whole.
+    If the run is finished and the request has no new budget, return the run's result instead. A finished run that has
+    lost its last checkpoints is continued, unless the request names a certain checkpoint.
+
+    Raises:
+        CheckpointError: if the run or its checkpoint cannot be read.
+        UsageError: if the new budget is already spent.
+        MachineError: if another process writes to the run.
     """
     from rlcli.runs.checkpoint_reader import open_checkpoint
     from rlcli.runs.restore import resolve_run
@@ -196,7 +210,7 @@ def resume_run(request: TrainingRequest) -> Job | TrainingResult:
     if run.record.get("state") == "finished" and not request.budget and folder is not None:
         step, last = open_checkpoint(folder).step, run.record.get("step", 0)
         if step >= last or is_checkpoint_ref(request.resume or ""):
-            _log.info("%s (%s) is finished; --max-iterations N continues it", run.folder, why)
+            _log.info("%s (%s) is finished; --max-iterations N continues the run", run.folder, why)
             return TrainingResult(run.folder, folder, step)
         _log.warning(
             "%s has lost its last checkpoint: it was finished at step %s, and its newest good checkpoint has step %s;"
@@ -224,7 +238,7 @@ def resume_run(request: TrainingRequest) -> Job | TrainingResult:
     if run.record.get("state") == WAITING:
         _log.info("run %s", run.shown)
     elif folder is None:
-        _log.info("%s (%s) ended before its first checkpoint: it starts again", run.shown, why)
+        _log.info("%s (%s) ended before its first checkpoint, so the training starts again", run.shown, why)
     else:
         _log.info("resuming %s (%s)", folder, why)
     initial = run.record.get("init_from") if folder is None else None
@@ -243,13 +257,16 @@ def resume_run(request: TrainingRequest) -> Job | TrainingResult:
 def setup_job(
     job: Job, device: str, stop: StopRequest, check_model: Callable[[Environment], None] = lambda _: None
 ) -> tuple[Trainer, Environment]:
-    """Build the trainer and its environment, with all heavy imports; remove a new run if that fails.
+    """Return the trainer and its environment, after all slow imports; if that fails, remove a new run.
 
     Args:
         job: run and settings of the training.
         device: device of the training.
-        stop: stop request; a signal ends the setup.
-        check_model: called with the environment; it raises an error if training must not start.
+        stop: stores signals; a signal ends the setup.
+        check_model: called with the environment; raises an error if training must not start.
+
+    Raises:
+        Stopped: on a signal.
     """
     try:
         with stop.before_training(interruptible=not distributed.launched()):
@@ -285,7 +302,7 @@ def _job_of_other_rank(message: dict[str, Any], request: TrainingRequest, resolv
 
 
 def process_device(wanted: str, gpus: int | None) -> str:
-    """Return the device of this process: with several processes, the GPU with the index of its local rank.
+    """Return the device of this process: with several processes, the GPU whose index is the process's local rank.
 
     Args:
         wanted: the option --device.
@@ -357,7 +374,7 @@ def _require_video(video_every: int | None) -> None:
 
 
 def _find_checkpoint(request: TrainingRequest) -> tuple[Run, Path | None, str]:
-    """Return the run to resume, its checkpoint, and how the run was chosen.
+    """Return the run to resume, its checkpoint, and as text how the run was chosen.
 
     The checkpoint is None if the run ended before its first checkpoint.
     """
@@ -380,12 +397,12 @@ def _find_checkpoint(request: TrainingRequest) -> tuple[Run, Path | None, str]:
 
 
 def _require_larger_budget(request: TrainingRequest, run: Run, folder: Path | None) -> None:
-    """Check that the new --max-iterations or --max-steps of a resumed run is above what is already done.
+    """Check that a new --max-iterations or --max-steps of a resumed run is above what the checkpoint has done.
 
-    Both count from the start of the training.
+    Both options count from the start of the training. `folder` is the checkpoint; None: the run has no checkpoint.
 
     Raises:
-        UsageError: with the progress of the checkpoint.
+        UsageError: if a new limit leaves nothing to train.
     """
     from rlcli.runs.checkpoint_reader import open_checkpoint
 
@@ -398,7 +415,7 @@ def _require_larger_budget(request: TrainingRequest, run: Run, folder: Path | No
         if wanted is not None and wanted <= number:
             option = f"--max-{unit}"
             done_text = f"{run.folder} has {number:,} {unit}"
-            message = f"{done_text}, and {option} counts from its start: {wanted:,} leaves nothing to train"
+            message = f"{done_text}, and {option} counts from the run's start: {wanted:,} leaves nothing to train"
             hint = f"give more than {number}, or leave out {option} to keep the run's budget"
             raise UsageError(message, hint=hint)
 

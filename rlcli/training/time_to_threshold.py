@@ -16,14 +16,15 @@ _METRICS = {"success": "Eval/success_rate", "return": "Eval/mean_reward", "lengt
 
 @dataclass(frozen=True, slots=True)
 class Threshold:
-    """Threshold of the option `--until KEY=X`: mean that an evaluation must reach."""
+    """Threshold of the option `--until KEY=X`, which the mean of an evaluation must reach."""
 
     key: str
     """Metric of the evaluation: success, return or length."""
     value: float
+    """Smallest mean of the metric that reaches the threshold."""
 
     def reached_by(self, row: Mapping[str, Any]) -> bool:
-        """Return whether the evaluation in a row of `metrics.jsonl` reached the threshold; False if there is none."""
+        """Return whether the evaluation in a row of `metrics.jsonl` reached the threshold; False without evaluation."""
         return bool(row.get(_METRICS[self.key], -math.inf) >= self.value)
 
     def is_certain(self, summary: Mapping[str, Any]) -> bool:
@@ -48,7 +49,7 @@ class TimeToThreshold:
     seconds: float
     """Time of all rollouts and updates until the threshold was reached, without evaluations [s]."""
     step: int
-    """Environment steps."""
+    """Number of environment steps until then."""
     iteration: int
 
 
@@ -70,7 +71,10 @@ def training_s(row: Mapping[str, Any]) -> float:
 
 
 def time_to_threshold(rows: Iterable[Mapping[str, Any]], threshold: Threshold) -> TimeToThreshold | None:
-    """Return when a training first reached a threshold, from all rows of `metrics.jsonl`; None if it did not."""
+    """Return when an evaluation of a training first reached a threshold; None if none did.
+
+    `rows` are all rows of the run's `metrics.jsonl`, oldest first.
+    """
     seconds = 0.0
     for row in rows:
         seconds += training_s(row)
@@ -82,7 +86,7 @@ def time_to_threshold(rows: Iterable[Mapping[str, Any]], threshold: Threshold) -
 def median(values: Sequence[float | None]) -> float | None:
     """Return the median, over seeds, of the times to the threshold.
 
-    A value is None if that training did not reach the threshold; the result is None if half of them did not.
+    A value is None if that training did not reach the threshold; the result is None if half of the trainings did not.
     """
     found = statistics.median([math.inf if value is None else value for value in values])
     return found if math.isfinite(found) else None

@@ -1,4 +1,4 @@
-"""Experiment trackers: Weights & Biases, MLflow and trackio.
+"""Loggers that send the metrics of a training to an experiment tracker: Weights & Biases, MLflow or trackio.
 
 Without settings of the user a tracker writes only to this machine. A tracker that fails after its start does not stop
 the training. A slow tracker delays only the end of the training, by at most a minute.
@@ -33,7 +33,7 @@ from rlcli.runs.safe_io import FileModel
 _log = logging.getLogger(__name__)
 
 _MAX_ROWS = 100_000
-"""Largest number of iterations that may wait for a tracker; with more, the tracker counts as failed."""
+"""Largest number of iterations whose metrics wait for a tracker; with more, the tracker counts as failed."""
 _TIMEOUT_S = 60.0
 """Time after which the end of a training no longer waits for a tracker [s]."""
 
@@ -52,7 +52,7 @@ class Tracker(Logger, Protocol):
     """Logger that stores the metrics of a run with an experiment tracker such as MLflow."""
 
     id: str
-    """Identifier of the run in the library; a resumed run continues it."""
+    """Identifier of the run in the tracker; a resumed run of rlcli continues the same run there."""
 
 
 class FailSafeLogger:
@@ -89,7 +89,10 @@ class FailSafeLogger:
 
 
 class BackgroundTracker:
-    """Tracker in a background thread. Only the end of a training waits for it, for a limited time."""
+    """Wrapper that runs a tracker in a background thread; only the end of a training waits for the thread.
+
+    The wait is at most `_TIMEOUT_S`.
+    """
 
     def __init__(self, tracker: Tracker) -> None:
         self._tracker = tracker
@@ -132,7 +135,7 @@ class BackgroundTracker:
 def open_tracker(
     name: str, kind: Callable[..., Tracker], run: Run, config: Mapping[str, Any], resume: tuple[int, int] | None
 ) -> FailSafeLogger:
-    """Open a tracker of a run. A resumed run continues in the tracker, and no step is recorded twice.
+    """Open a tracker for a run. A resumed run continues the same run in the tracker, and no step is recorded twice.
 
     `run.json` stores the identifier of the run in the tracker, and the last step that the tracker had when the run was
     resumed.
@@ -154,7 +157,7 @@ def open_tracker(
             tracker = contextvars.copy_context().run(kind, run, config, stored and stored.id)
     except Exception as error:
         message = f"the logger {name} cannot be opened: {one_line(error, 300)}"
-        raise MachineError(message, hint="use --logger none to train without it") from error
+        raise MachineError(message, hint="use --logger none to train without this logger") from error
     last_step = 0
     if resume is not None and stored is not None and tracker.id == stored.id:
         last_step = max(stored.step, resume[1])
@@ -178,7 +181,10 @@ class _LibraryRun:
 
 
 class Wandb(_LibraryRun):
-    """Tracker for Weights & Biases: online with an API key, else offline. Its files are in the run's folder."""
+    """Tracker for Weights & Biases: online with an API key, else offline; its files are in the run's folder.
+
+    `config` is the resolved configuration, `resume_id` the identifier of the run in the tracker; None: a new run.
+    """
 
     def __init__(self, run: Run, config: Mapping[str, Any], resume_id: str | None) -> None:
         _set_default_variables(WANDB_ERROR_REPORTING="false", WANDB_SILENT="true")
@@ -211,7 +217,10 @@ class Wandb(_LibraryRun):
 
 
 class MLflow:
-    """Tracker for MLflow: at MLFLOW_TRACKING_URI, else in files in the run's folder."""
+    """Tracker for MLflow: at MLFLOW_TRACKING_URI, else in files in the run's folder.
+
+    `config` is the resolved configuration, `resume_id` the identifier of the run in the tracker; None: a new run.
+    """
 
     def __init__(self, run: Run, config: Mapping[str, Any], resume_id: str | None) -> None:
         _set_default_variables(
@@ -262,7 +271,10 @@ class MLflow:
 
 
 class Trackio(_LibraryRun):
-    """Tracker for trackio: a database in TRACKIO_DIR, else in the run's folder."""
+    """Tracker for trackio: a database in TRACKIO_DIR, else in the run's folder.
+
+    `config` is the resolved configuration, `resume_id` the identifier of the run in the tracker; None: a new run.
+    """
 
     def __init__(self, run: Run, config: Mapping[str, Any], resume_id: str | None) -> None:
         _set_default_variables(
@@ -329,11 +341,11 @@ def _set_default_variables(**variables: str) -> None:
 
 @contextlib.contextmanager
 def _without_stdout() -> Iterator[None]:
-    """Discard the output of a library to stdout, which is for the command's result."""
+    """Discard what a library prints to stdout in the `with` block: stdout is for the result of the command."""
     with open(os.devnull, "w", encoding="utf-8") as nothing, contextlib.redirect_stdout(nothing):
         yield
 
 
 def _mlflow_name(name: str) -> str:
-    """Return a name with only the characters that MLflow allows, at most 250."""
+    """Return a metric's name with the characters that MLflow does not allow replaced by `_`, cut to 250 characters."""
     return re.sub(r"[^\w\-./: ]", "_", name)[:250]

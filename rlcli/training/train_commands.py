@@ -1,6 +1,6 @@
-"""Start and control of `rlcli train` commands in subprocesses, for sweeps and for several seeds.
+"""Start and control `rlcli train` commands in subprocesses, for sweeps and for several seeds.
 
-A signal that stops this process also stops all of these trainings.
+A signal that stops this process also stops all trainings in subprocesses.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from rlcli.training.signals import StopRequest
 _log = logging.getLogger(__name__)
 
 STOP_WITH_PARENT = "RLCLI_LEASH"
-"""Environment variable with which a subprocess stops when its standard input closes, as it does if its parent ends."""
+"""Environment variable with which a subprocess stops when its parent process ends (its standard input then closes)."""
 LOG = "train.log"
 """File in a run with the messages of its process."""
 POLL_S = 0.1
@@ -41,6 +41,7 @@ class TrainingProcess:
     """Folder of the run."""
     process: subprocess.Popen[bytes]
     stop_requested: bool = False
+    """Whether `stop` was called."""
     document: dict[str, Any] = field(default_factory=dict)
     """JSON document that the process has printed; empty while it runs."""
 
@@ -73,7 +74,7 @@ class TrainingProcess:
         return self.exit_code != 0 and not (self.stop_requested and self.exit_code == STOPPED)
 
     def error(self) -> RlcliError:
-        """Return the error that the process has printed, or an error with the path of its log."""
+        """Return the error that the process has printed, or if there is none, an error with the path of its log."""
         printed = self.document.get("error")
         if not isinstance(printed, dict):
             error = RlcliError(f"rlcli ended with exit code {self.exit_code}; its messages are in {self.run / LOG}")
@@ -85,7 +86,7 @@ class TrainingProcess:
 
 
 def start_command(run: Path, words: Sequence[str]) -> TrainingProcess:
-    """Start `rlcli WORDS --json` in a subprocess; its messages are appended to a log in the run."""
+    """Start `rlcli WORDS --json` in a subprocess; its messages are appended to the file `LOG` in the run's folder."""
     # a new process group: Ctrl-C reaches the subprocess once, through this process
     group = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP} if os.name == "nt" else {"start_new_session": True}  # type: ignore[attr-defined]
     with (run / LOG).open("ab") as log:
@@ -123,15 +124,15 @@ def stop_with_parent() -> None:
 def train_all(
     runs: Iterable[Path], device: str, jobs: int, options: Sequence[str], stop: StopRequest, poll: Callable[[], None]
 ) -> list[TrainingProcess]:
-    """Train runs in subprocesses until all have ended. After a signal stop all of them and start no more.
+    """Train runs in subprocesses until all have ended; after a signal stop all processes and start no more.
 
     Args:
         runs: folders of the runs.
         device: device of the trainings.
         jobs: largest number of processes at a time.
-        options: further options of each command.
-        stop: stop request of a signal.
-        poll: called every `POLL_S` seconds.
+        options: further options of each `rlcli train` command.
+        stop: stores whether a signal has asked this process to stop.
+        poll: called every `POLL_S` seconds while processes run.
 
     Returns:
         The processes in the order in which they have ended.

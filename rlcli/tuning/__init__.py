@@ -1,1 +1,1 @@
-"""Modules that run many trainings: with several seeds, in a sweep (hyperparameter search), or to measure speed."""
+"""Code that runs many trainings: with several seeds, in a sweep (hyperparameter search), or to measure their speed."""

@@ -1,11 +1,11 @@
 """Benchmark of `rlcli bench`: speed of a task on this machine, and the sizes and threads that train fastest.
 
-Sizes are the number of environments, the steps of a rollout and the number of minibatches. Workers are processes that
-step a part of the environments each (`scene.workers`).
+Sizes are the number of environments, the steps of a rollout and the number of minibatches. Workers are processes, each
+of which steps a part of the environments (`scene.workers`).
 
-Only settings that train equally are compared: they have the same number of samples in an iteration, and the same number
-and size of gradient steps. Then the time of an iteration decides the time to a solution. More steps per second with
-fewer gradient steps per sample would be no gain.
+A setting is recommended only if it learns as much in an iteration as the task's own setting: with the same number of
+samples, and the same number and size of gradient steps. The setting with the shortest iteration is then the fastest.
+More steps per second, but fewer gradient steps per sample, would be no gain.
 """
 
 import contextlib
@@ -33,32 +33,36 @@ from rlcli.training.setup import make_trainer
 SIZES = (16, 64, 256, 1_024, 4_096, 16_384)
 """Numbers of environments that are measured."""
 HORIZONS = ("num_steps", "n_steps", "num_steps_per_env", "train_freq")
-"""Keys that trainers use for the number of steps of each environment in an iteration."""
+"""Configuration keys that agents use for the number of steps of each environment in an iteration."""
 UNSTEADY = 0.15
-"""Relative spread above which a measurement is repeated, and the machine is reported as busy."""
+"""Spread (see `Stepped.spread`) above which a measurement is repeated, and the machine is reported as busy."""
 WORTH = 0.97
-"""`rlcli bench` recommends another setting only if its iteration takes less than this share of the present time."""
+"""A setting is recommended only if its iteration takes less than this share of an iteration with the task's own one."""
 _ACTIONS = 8
-"""Number of batches of random actions that the environments receive in turn."""
+"""Number of batches of random actions with which the environments are stepped in turn."""
 _ENV_BYTES = 256 * 2**10
 """Assumed memory of one environment before the first measurement [bytes]."""
 
 
 @dataclass(frozen=True, slots=True)
 class Pace:
-    """Duration and number of the measurements of `rlcli bench`. A block is a series of calls that is timed as one."""
+    """Duration and number of the measurements of `rlcli bench`.
+
+    A block is a series of calls (of `step`, or of a training iteration) that is timed as a whole.
+    """
 
     block_s: float = 0.4
     """Shortest duration of a block of calls [s]."""
     blocks: int = 5
-    """Blocks in one round."""
+    """Number of blocks in a round."""
     rounds: int = 3
-    """Largest number of rounds, if the blocks differ by more than UNSTEADY."""
+    """Largest number of rounds; after a round, another one follows only if the spread is above `UNSTEADY`."""
     longest_s: float = 4.0
-    """Duration of a step [s] above which a number of environments is not measured."""
+    """Duration of a step of all environments [s] above which a number of environments is not measured."""
 
 
 QUICK = Pace(block_s=0.05, blocks=3, rounds=1, longest_s=1.0)
+"""Pace for `rlcli bench --quick`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,12 +71,15 @@ class Stepped:
 
     num_envs: int
     engine_threads: int
+    """Number of threads of the physics engine."""
     workers: int
+    """Number of processes, each of which steps a part of the environments."""
     steps_per_s: float | None = None
+    """Environment steps per second, summed over all environments; None: not measured."""
     physics: float | None = None
-    """Share of the physics in the time of a step."""
+    """Share of the physics in the time of a step, from 0 to 1."""
     spread: float | None = None
-    """Interquartile range of the blocks, divided by their median."""
+    """Interquartile range of the durations of the blocks, divided by their median."""
     resident: int | None = None
     """Resident memory of the process [bytes]."""
     left_out: str | None = None
@@ -85,10 +92,13 @@ class Setting:
 
     num_envs: int
     horizon: int | None
+    """Steps of each environment in an iteration; None: the agent has no such setting."""
     minibatches: int | None
+    """Number of minibatches of an epoch; None: the agent has no such setting, or sets the minibatches' size."""
     engine_threads: int
     torch_threads: int
     workers: int
+    """Number of processes, each of which steps a part of the environments."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,23 +110,26 @@ class Trained:
     """Whether an iteration has as many samples and gradient steps as with the task's own setting, so that a training
     learns equally."""
     samples: int = 0
-    """Samples in an iteration."""
+    """Number of samples (environment steps) in an iteration."""
     seconds: float | None = None
-    """Median duration of an iteration [s]."""
+    """Median duration of an iteration [s]; None: not measured."""
     shares: Mapping[str, float] = field(default_factory=dict)
-    """Part (physics, task, policy, update) -> its share of the time."""
+    """Part of an iteration (physics, task, policy, update) -> its share of the time, from 0 to 1."""
     spread: float | None = None
+    """Interquartile range of the durations of the blocks, divided by their median."""
     resident: int | None = None
+    """Resident memory of the process [bytes]."""
     left_out: str | None = None
+    """Reason why this setting was not measured; None: it was measured."""
 
     @property
     def steps_per_s(self) -> float | None:
-        """Environment steps per second of rollout and update together."""
+        """Environment steps per second of rollout and update together; None: not measured."""
         return None if self.seconds is None else self.samples / self.seconds
 
     @property
     def milliseconds(self) -> float | None:
-        """Duration of an iteration [ms]."""
+        """Median duration of an iteration [ms]; None: not measured."""
         return None if self.seconds is None else 1e3 * self.seconds
 
 
@@ -126,9 +139,11 @@ class Findings:
 
     stepped: list[Stepped] = field(default_factory=list)
     trained: list[Trained] = field(default_factory=list)
+    """All measured settings; the first is the task's own setting."""
     present: Trained | None = None
-    """The task's own setting, measured in alternation with the recommended one."""
+    """The task's own setting, measured in alternation with the fastest one; None: not measured yet."""
     recommended: Trained | None = None
+    """The recommended setting; equal to `present` if no setting is clearly faster; None: not measured yet."""
 
     @property
     def unsteady(self) -> bool:
@@ -138,7 +153,7 @@ class Findings:
         return bool(spreads) and statistics.median(spreads) > UNSTEADY
 
     def record(self) -> dict[str, Any]:
-        """Return the measurements as JSON data: environment, training, unsteady."""
+        """Return the measurements as JSON data, with the entries `environment`, `training` and `unsteady`."""
         rows = []
         for one in self.trained:
             entries = asdict(one)
@@ -157,7 +172,7 @@ class _Training:
     """Part -> duration [s], for each iteration."""
 
     def iterate(self) -> None:
-        """Run one training iteration and keep its durations."""
+        """Run a training iteration, and add the durations of its parts to `seconds`."""
         self.seconds.append(self.trainer.iterate().seconds)
 
     def row(self, setting: Setting, *, alike: bool) -> Trained:
@@ -165,7 +180,7 @@ class _Training:
 
         Args:
             setting: sizes and threads of the training.
-            alike: whether the setting trains as the task's own one does, see `Trained.alike`.
+            alike: whether a training learns equally as with the task's own setting, see `Trained.alike`.
         """
         total = sum(sum(parts.values()) for parts in self.seconds)
         names = dict.fromkeys(name for parts in self.seconds for name in parts)
@@ -178,10 +193,13 @@ class Bench:
     """Benchmark of one task and agent.
 
     Args:
-        resolve: returns the configuration after some changes (dotted key -> value).
-        pace: duration of the measurements.
-        announce: called before each measurement with its description.
-        show: called after each measurement.
+        resolve: returns the task's configuration, changed by the given values (dotted key -> value).
+        pace: duration and number of the measurements.
+        announce: called before each measurement with a description of the measurement.
+        show: called after each measurement with all measurements so far.
+
+    Raises:
+        ConfigError: if the configuration has no agent.
     """
 
     def __init__(
@@ -204,13 +222,17 @@ class Bench:
         self.present = Setting(present.task.scene.num_envs, horizon, minibatches, engine, update, workers)
 
     def run(self) -> Findings:
-        """Run all measurements and return them; if it is interrupted, `findings` has the finished ones."""
+        """Run all measurements and return them; after an interrupt, `findings` has the finished measurements.
+
+        Raises:
+            ConfigError: if a training with the task's own setting cannot be made.
+        """
         self._step_all()
         self._train_all()
         return self.findings
 
     def changes(self, setting: Setting) -> dict[str, Any]:
-        """Return the values of the configuration that a setting changes, by dotted key."""
+        """Return a setting as changes of the configuration: dotted key -> value."""
         changed: dict[str, Any] = {
             "scene.num_envs": setting.num_envs,
             "sim.engine_threads": setting.engine_threads,
@@ -226,6 +248,7 @@ class Bench:
     # --- the environment alone ---
 
     def _step_all(self) -> None:
+        """Measure the speed of the environments without training, for each size, number of threads and workers."""
         present = self.present
         threads, workers, counts = present.engine_threads, present.workers, _powers(available_cores())
         sizes = [(num_envs, threads, min(workers, num_envs // 2)) for num_envs in SIZES]
@@ -260,7 +283,7 @@ class Bench:
             return Stepped(num_envs, engine_threads, workers, rate, physics, _spread(blocks), resident_memory())
 
     def _too_large(self, num_envs: int) -> str | None:
-        """Return the reason (memory, time) why this number of environments is not measured; None if it is measured."""
+        """Return why a number of environments is not measured (too much memory or time); None if it can be measured."""
         smaller = [row for row in self.findings.stepped if row.left_out is None and row.num_envs < num_envs]
         measured = sorted(smaller, key=lambda row: row.num_envs)
         first, last = (measured[0], measured[-1]) if measured else (None, None)
@@ -290,9 +313,9 @@ class Bench:
         self._compare(best)
 
     def _sizes(self, setting: Setting) -> Iterator[Setting]:
-        """Yield settings with half and twice the environments, and rollouts of twice and half the steps.
+        """Yield the setting with half the environments and twice the steps of a rollout, and with twice and half.
 
-        So the number of samples in an iteration stays equal.
+        The number of samples in an iteration stays equal. Nothing is yielded for an agent without such a setting.
         """
         if setting.horizon is None:
             return
@@ -326,16 +349,16 @@ class Bench:
 
     @contextlib.contextmanager
     def _open_training(self, setting: Setting) -> Iterator[_Training]:
-        """Build a training with a setting for a `with` block, ready for `iterate`."""
+        """Build a training with a setting for a `with` block, and start its first episodes."""
         trainer, env = make_trainer(self._resolve(self.changes(setting)), 42, "cpu", setting.torch_threads)
         with contextlib.closing(env):
             trainer.start()
             yield _Training(trainer)
 
     def _compare(self, best: Trained) -> None:
-        """Measure the fastest and the present setting again, in alternation.
+        """Measure the fastest and the task's own setting again, in alternation, and store which of them is recommended.
 
-        Other programs that load the machine then slow down both settings equally.
+        Because of the alternation, other programs that load the machine slow down both settings equally.
         """
         present = self.findings.trained[0]
         if best.setting == present.setting:
@@ -359,7 +382,7 @@ class Bench:
 
 
 def system_load() -> float | None:
-    """Return the mean number of running processes in the last minute (the system's load); None if it is unknown."""
+    """Return the mean number of running processes in the last minute (the system's load); None if unknown."""
     with contextlib.suppress(AttributeError, OSError):
         return os.getloadavg()[0]
     return None
@@ -368,7 +391,7 @@ def system_load() -> float | None:
 def _blocks(call: Callable[[], object], pace: Pace) -> list[float]:
     """Call a function repeatedly, in blocks; return the mean duration of a call in each block [s].
 
-    If the blocks differ too much, more blocks are measured.
+    While the spread is above `UNSTEADY`, further rounds follow, up to `pace.rounds`.
     """
     blocks: list[float] = []
     for _ in range(pace.rounds):
@@ -396,17 +419,18 @@ def _spread(blocks: list[float]) -> float:
 
 
 def _powers(most: int) -> list[int]:
-    """Return the numbers of threads to measure: 1, 2, 4, ... up to `most`, and `most` itself."""
+    """Return the numbers of threads or workers to measure: 1, 2, 4, ... up to `most`, and `most` itself."""
     return sorted({*(2**n for n in range(int(math.log2(most)) + 1)), most})
 
 
 def _fastest(rows: list[Trained]) -> Trained:
-    """Return the fastest measurement among settings with equal samples and gradient steps per iteration."""
+    """Return the row with the shortest iteration among the measured rows with `alike`."""
     measured = [row for row in rows if row.alike and row.seconds is not None]
     return min(measured, key=lambda row: row.seconds or math.inf)
 
 
 def _describe(setting: Setting) -> str:
+    """Return a setting as text, such as `64 environments, 32 steps, engine threads 4, torch threads 1, workers 0`."""
     parts = [f"{setting.num_envs:,} environments"]
     if setting.horizon is not None:
         parts.append(f"{setting.horizon} steps")

@@ -1,6 +1,6 @@
-"""Comparison of `rlcli sweep compare`: how long training takes to reach a threshold, with two kinds of settings.
+"""`rlcli sweep compare`: time to a threshold, with the settings of a sweep's best trial and with the task's own ones.
 
-One kind are the settings of a sweep's best trial, the other the task's own settings.
+The threshold is a value of a metric of the evaluation, such as `success=0.99`.
 """
 
 import logging
@@ -38,11 +38,14 @@ class Training:
     """One training of `sweep compare`: with one seed, and with the task's own or the best trial's settings."""
 
     arm: str
-    """Which settings the training has: `default` or `best`, see `ARMS`."""
+    """Which settings the training has: `default` (the task's own) or `best` (the best trial's)."""
     seed: int
     folder: Path
+    """Folder of the training's run, inside the sweep's folder."""
     reached: TimeToThreshold | None = None
+    """When the training reached the threshold; None: not reached."""
     error: RlcliError | None = None
+    """Why the training failed; None: not failed."""
 
     @property
     def state(self) -> str:
@@ -50,7 +53,7 @@ class Training:
         return "failed" if self.error else "reached" if self.reached else "not reached"
 
     def time(self) -> dict[str, float | None]:
-        """Return `seconds` and `steps` until the threshold was reached; None for both if it was not."""
+        """Return `seconds` (training time) and `steps` (environment steps) to the threshold; None: not reached."""
         if self.reached is None:
             return {"seconds": None, "steps": None}
         return {"seconds": self.reached.seconds, "steps": self.reached.step}
@@ -61,28 +64,30 @@ class Comparison:
     """Trainings with the task's own settings and with those of the best trial, and their times to the threshold."""
 
     sweep: Path
+    """Folder of the sweep."""
     task: str
+    """Name of the task."""
     threshold: Threshold
     trial: int
     """Index of the best trial."""
     seeds: Sequence[int]
     trainings: list[Training] = field(default_factory=list)
     stop_code: int | None = None
-    """The exit code of a signal that stopped the comparison before its end."""
+    """Exit code for the signal that stopped the comparison before its end; None: not stopped."""
 
     @property
     def exit_code(self) -> int:
-        """The exit code of the first training that failed; 0 if none has failed."""
+        """Exit code of the first training that failed; 0 if no training has failed."""
         return next((one.error.exit_code for one in self.trainings if one.error is not None), 0)
 
     def training(self, seed: int, arm: str) -> Training | None:
-        """Return the training with a seed and settings (`default` or `best`); None if it has not run."""
+        """Return the training with a seed and settings (`default` or `best`); None if that training has not run."""
         return next((one for one in self.trainings if (one.seed, one.arm) == (seed, arm)), None)
 
     def medians(self) -> dict[str, dict[str, float | None]]:
-        """Return the medians over seeds: settings (`default`, `best`) -> {seconds, steps}.
+        """Return the medians of the times to the threshold over seeds: `default`, `best` -> {seconds, steps}.
 
-        Settings that were not trained with all seeds yet are left out.
+        Settings that were not yet trained with all seeds are left out.
         """
         medians = {}
         for arm in ARMS:
@@ -92,9 +97,9 @@ class Comparison:
         return medians
 
     def ratios(self) -> dict[str, float | None]:
-        """Return the medians with the best trial's settings divided by those with the task's own: {seconds, steps}.
+        """Return the medians of the best trial's settings divided by those of the task's own: {seconds, steps}.
 
-        Empty until both were trained with all seeds.
+        The result is empty until both were trained with all seeds; a ratio is None without a median.
         """
         medians = self.medians()
         if len(medians) < len(ARMS):
@@ -126,20 +131,20 @@ def compare(
 ) -> Comparison:
     """Train with the task's own settings and with those of the best trial, until an evaluation reaches the threshold.
 
-    The trainings run one after the other. They are kept in the sweep's folder, so that the same command continues after
-    an interruption.
+    The trainings run one after the other, as runs in the sweep's folder; after an interruption, a call with the same
+    arguments continues these runs.
 
     Args:
         sweep: the sweep.
         request: the device, the budget and the overrides of all trainings.
         seeds: the seeds of the trainings.
-        until: the threshold, such as `success=0.99`.
+        until: the threshold, such as `success=0.99`; None: `success=0.99`.
         episodes: number of episodes of an evaluation.
-        stop: the request to stop by a signal.
+        stop: stores whether a signal has asked to stop; signals are handled while the trainings run.
 
     Raises:
         CheckpointError: if no trial has finished.
-        UsageError: if the task defines no success and `until` is None.
+        UsageError: if the task defines no success and `until` is None or names success, or if `until` is not valid.
     """
     best = sweep.best()
     if best is None:
@@ -149,14 +154,14 @@ def compare(
     with _request_of_sweep(sweep, request) as base:
         resolved, _ = base.resolve()
         if not resolved.task.success and until is None:
-            raise UsageError("the task defines no success, so --until is needed", hint="add --until return=X")
+            raise UsageError("the task defines no success, so --until is required", hint="add --until return=X")
         require_success(resolved, [threshold.key], "--until return=X")
         if resolved.agent is not None and not resolved.agent.eval_interval:
             base.overrides.append("agent.eval_interval=1")
         base.overrides.append(f"agent.eval_episodes={episodes}")
         count, agent = len(ARMS) * len(seeds), resolved.require_agent()[0]
         budget = f"{agent.max_iterations:,} iterations" if agent.max_iterations else f"{agent.max_steps:,} steps"
-        _log.info(f"{count} trainings, each of at most {budget}; fewer --seeds or --max-iterations N shorten this")
+        _log.info(f"{count} trainings, each of at most {budget}; fewer --seeds or --max-iterations N shorten them")
         changes: dict[str, list[str]] = {"default": [], "best": sweep.overrides(sweep.values(best))}
         with stop, track("trainings", count) as work:
             for turn, seed in enumerate(seeds):
@@ -178,7 +183,8 @@ def compare(
 def _request_of_sweep(sweep: Sweep, request: TrainingRequest) -> Iterator[TrainingRequest]:
     """Return a copy of a training's request for a `with` block, with the settings that all trials of a sweep share.
 
-    The copy keeps the budget of the request. A temporary file has the content of the sweep's `--config` file.
+    The copy keeps the budget, the device and the overrides of the request. During the block, a temporary file has the
+    content of the sweep's `--config` file.
     """
     from rlcli.runs.restore import recorded_task
 
@@ -202,7 +208,10 @@ def _request_of_sweep(sweep: Sweep, request: TrainingRequest) -> Iterator[Traini
 def _train(
     comparison: Comparison, request: TrainingRequest, arm: str, changes: Sequence[str], stop: StopRequest
 ) -> Training:
-    """Train with the settings `arm` (`default` or `best`) until the threshold, the end of the budget, or a signal."""
+    """Train with the settings `arm` (`default` or `best`) until the threshold, the end of the budget, or a signal.
+
+    A run with the same settings in the sweep's folder is continued. `changes` are overrides (`KEY=VALUE`).
+    """
     seed, threshold = request.seed, comparison.threshold
     name = "compare-default" if arm == "default" else f"compare-trial-{comparison.trial:04d}"
     training = Training(arm, seed, _run_folder(comparison.sweep, f"{name}-seed-{seed}", request, changes))
@@ -238,9 +247,9 @@ def _train(
 
 
 def _run_folder(sweep: Path, name: str, request: TrainingRequest, changes: Sequence[str]) -> Path:
-    """Return the folder for a training: a new one, or the folder of a run with exactly these settings, to resume it.
+    """Return the folder for a training: a new folder, or that of an earlier run with exactly the same configuration.
 
-    A number is appended to the name if a run with other settings has it already.
+    A number is appended to the name if a run with another configuration has the name already.
 
     Args:
         sweep: folder of the sweep.

@@ -1,7 +1,4 @@
-"""Storage of a sweep's trials by the library Optuna.
-
-It is a journal file in the sweep's folder, or a database that several machines share.
-"""
+"""Storage of a sweep's trials by the library Optuna: a journal file in the sweep's folder, or a shared database."""
 
 from __future__ import annotations
 
@@ -25,10 +22,11 @@ if TYPE_CHECKING:
 
 JOURNAL = "journal.log"
 _CONNECT_S = 20
-"""Time after which a database that does not answer is an error [s]."""
+"""Time after which an error is raised if a database does not answer [s]."""
 _WITH_CONNECT_TIMEOUT = ("postgresql", "psycopg", "psycopg2", "mysql", "mysqldb", "pymysql")
 """Database drivers of SQLAlchemy, and dialects that use them by default, which have the option `connect_timeout`."""
 _MAX_JOURNAL = 512 * 2**20
+"""Largest size of a journal file [bytes]."""
 _ATTEMPTS = 5
 """Number of attempts to create the tables of a database: another machine may create them at the same time."""
 
@@ -37,23 +35,24 @@ def check_optuna() -> None:
     """Check that Optuna is installed.
 
     Raises:
-        DependencyError: with the line that installs it.
+        DependencyError: if not, with the command that installs Optuna.
     """
     if importlib.util.find_spec("optuna") is None:
         raise DependencyError("a sweep needs Optuna", hint=pip_install("rlcli[sweep]"))
 
 
 def open_study(folder: Path, settings: Mapping[str, Any], storage: str | None, *, create: bool) -> optuna.Study:
-    """Open Optuna's study of a sweep.
+    """Open the Optuna study that stores the trials of a sweep.
 
     Args:
         folder: the folder of the sweep, which contains the journal file.
-        settings: settings of the sweep: `task`, `name`, `direction` and `pruner` (median or none).
-        storage: URL of a database; None uses the journal.
+        settings: settings of the sweep: `task`, `name`, `direction` (maximize or minimize), `pruner` (median or none).
+        storage: URL of a database; None: the journal file in the folder.
         create: whether to create the study if it does not exist.
 
     Raises:
-        CheckpointError: if the study does not exist, or its journal is damaged.
+        CheckpointError: if the study does not exist and `create` is false, or if the journal is damaged.
+        DependencyError: if a package for the database is not installed.
         MachineError: if the database cannot be reached, or the folder cannot be written.
         UsageError: if `storage` is not the URL of a database.
     """
@@ -74,17 +73,17 @@ def open_study(folder: Path, settings: Mapping[str, Any], storage: str | None, *
             return optuna.create_study(**study, direction=settings["direction"], load_if_exists=True)
         except KeyError:
             if storage is None and (folder / JOURNAL).stat().st_size > 0:
-                raise _corrupt(folder / JOURNAL, ValueError(f"it has no entry of the sweep '{name}'")) from None
+                raise _corrupt(folder / JOURNAL, ValueError(f"the file has no entry of the sweep '{name}'")) from None
             where = without_password(storage) if storage else folder
-            raise CheckpointError(f"there is no sweep '{name}' in {where}; see `rlcli sweep show`") from None
+            raise CheckpointError(f"{where} has no sweep '{name}'; see `rlcli sweep show`") from None
 
 
 @contextlib.contextmanager
 def storage_errors(storage: str | None) -> Iterator[None]:
-    """Convert errors of a sweep's database inside a `with` block; other errors are raised unchanged.
+    """Convert errors of a sweep's database inside a `with` block to `MachineError`; raise other errors unchanged.
 
     Args:
-        storage: URL of the database; None: the sweep has none.
+        storage: URL of the database; None: the sweep has no database.
 
     Raises:
         MachineError: if the database cannot be reached.
@@ -109,6 +108,15 @@ def without_password(url: str) -> str:
 
 
 def _journal(folder: Path, create: bool) -> optuna.storages.BaseStorage:
+    """Return the storage in the journal file of a sweep's folder.
+
+    Args:
+        folder: the folder of the sweep.
+        create: whether the file may be missing.
+
+    Raises:
+        CheckpointError: if the file is missing, too large or damaged.
+    """
     from optuna.storages import JournalStorage
     from optuna.storages.journal import JournalFileBackend
 
@@ -122,7 +130,7 @@ def _journal(folder: Path, create: bool) -> optuna.storages.BaseStorage:
     lock: Any = FileLock(folder / f".{JOURNAL}")  # the operating system releases the lock when the process is killed
 
     class Backend(JournalFileBackend):
-        """Optuna's journal file. It repairs lines that a full disk cut short, and checks the file for damage."""
+        """Optuna's journal file that removes an incomplete last line, and raises an error if the file is damaged."""
 
         def append_logs(self, logs: list[dict[str, Any]]) -> None:
             with lock, disk_errors(file):
@@ -154,12 +162,13 @@ def _journal(folder: Path, create: bool) -> optuna.storages.BaseStorage:
 
 
 def _corrupt(file: Path, error: Exception) -> CheckpointError:
+    """Return the error for a damaged journal file."""
     hint = "choose another --name for a new sweep; the runs of the trials are not damaged"
     return CheckpointError(f"{file} is corrupt: {type(error).__name__}: {one_line(error)}", hint=hint)
 
 
 def _remove_partial_line(file: Path) -> None:
-    """Remove the incomplete last line that a killed process has left in a journal; the caller holds the lock."""
+    """Remove an incomplete last line of a journal file; the caller holds the lock of the file."""
     with file.open("r+b") as journal:
         size = begin = journal.seek(0, 2)
         tail = b""
@@ -173,11 +182,12 @@ def _remove_partial_line(file: Path) -> None:
 
 
 def _database(url: str) -> optuna.storages.BaseStorage:
+    """Return the storage in a database; see `open_study` for the errors."""
     try:
         import sqlalchemy
         from optuna.storages import RDBStorage
     except ImportError:
-        raise DependencyError("a shared storage needs SQLAlchemy", hint=pip_install("rlcli[sweep]")) from None
+        raise DependencyError("--storage needs the package sqlalchemy", hint=pip_install("rlcli[sweep]")) from None
     try:
         options: dict[str, Any] = {"poolclass": sqlalchemy.pool.NullPool}  # connections time out during a trial
         driver = sqlalchemy.make_url(url).drivername.rpartition("+")[2]
@@ -190,7 +200,7 @@ def _database(url: str) -> optuna.storages.BaseStorage:
         return RDBStorage(url, engine_kwargs=options)
     except ImportError as error:
         driver = getattr(error.__cause__ or error, "name", None) or url.partition(":")[0]
-        raise DependencyError(f"--storage needs the driver {driver}", hint=pip_install(driver)) from None
+        raise DependencyError(f"--storage needs the database driver {driver}", hint=pip_install(driver)) from None
     except (sqlalchemy.exc.ArgumentError, sqlalchemy.exc.NoSuchModuleError, ValueError, LookupError) as error:
         message = f"--storage '{without_password(url)}' is not the URL of a database: {_first_line(error)}"
         raise UsageError(message, hint="write a URL such as postgresql+psycopg://user@host/name") from None
@@ -209,6 +219,7 @@ def _is_database_error(error: BaseException) -> bool:
 
 
 def _first_line(error: BaseException) -> str:
+    """Return the first line of an error's text, of the database driver's error if there is one."""
     cause = error.__cause__ or error
     cause = getattr(cause, "orig", None) or cause
     return (str(cause).strip().splitlines() or [type(cause).__name__])[0][:300]

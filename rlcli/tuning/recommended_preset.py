@@ -1,6 +1,6 @@
 """Text of the preset that `rlcli bench` writes: a file for `--config` with the recommended settings.
 
-Comments in the file contain the measurements.
+The comments of the file are the measurements that led to the recommendation.
 """
 
 from collections.abc import Mapping
@@ -21,8 +21,8 @@ def bench_preset(
         resolved: the task's configuration with the changes of the command line.
         changes: the recommended settings: dotted key -> value.
         findings: the measurements.
-        machine: properties of the machine: `cpu`, `cores` and `versions` (package -> version).
-        agent_named: whether the command line names the agent; the preset then makes it the default.
+        machine: properties of the machine: `cpu` (its name), `cores` (their number), `versions` (package -> version).
+        agent_named: whether the command line names the agent; the preset then makes that agent the default.
     """
     data = preset_of(resolved, agent_named)
     for key, value in changes.items():
@@ -38,22 +38,26 @@ def bench_preset(
 
 
 def explanation(findings: Findings) -> list[str]:
-    """Return the recommendation and its reason as sentences, for the terminal and the preset's comments."""
+    """Return the recommendation and its reason as lines of text, for the terminal and the comments of the preset.
+
+    The list is empty before the benchmark has finished.
+    """
     present, best = findings.present, findings.recommended
     if present is None or best is None:
         return []
     if best is present:
-        reason = "the present sizes and threads are the fastest of the settings that train equally:"
+        reason = "the present sizes and threads are the fastest of all settings that learn equally per iteration:"
         lines = [f"{reason} {_describe(present)}"]
     else:
         lines = [f"{_describe(best)},", f"instead of {_describe(present)}, measured in alternation"]
-    lines.append("all compared settings have the same samples and gradient steps per iteration, so they train equally")
+    lines.append("all compared settings have the same number of samples and gradient steps per iteration")
     if findings.unsteady:
-        lines.append("the machine was busy, so the measurements vary: end other programs and measure again")
+        lines.append("the measurements vary because the machine is busy: end other programs and measure again")
     return lines
 
 
 def _describe(row: Trained) -> str:
+    """Return a measured row as text: time per iteration, speed, shares of the parts, spread."""
     assert row.seconds is not None
     assert row.steps_per_s is not None
     shares = ", ".join(f"{name} {share:.0%}" for name, share in row.shares.items())

@@ -1,6 +1,6 @@
-"""Runner of a sweep's trials: it trains and evaluates each trial in a subprocess.
+"""Run the trials of a sweep: train and evaluate each trial in subprocesses, and prune trials.
 
-It also stops (prunes) trials that learn worse than most.
+To prune a trial is to stop its training early, because other trials were better after the same share of their budget.
 """
 
 import logging
@@ -27,27 +27,27 @@ from rlcli.tuning.sweep import Sweep, Trial
 _log = logging.getLogger(__name__)
 
 _REPORT_EVERY_S = 1.0
-"""Time between two reports of a trial's progress to the pruner [s]."""
+"""Time between two reports of a trial's progress to Optuna's pruner [s]."""
 _PRUNER_STEPS = 100
-"""Steps of the pruner: it compares trials at each percent of their budget."""
+"""Number of steps into which the budget of a trial is divided; the pruner compares trials at the same step."""
 _MAX_FAILURES = 3
-"""Number of failed trials after which a sweep without a successful trial ends with an error."""
+"""Number of failed trials after which a sweep ends with an error, if no trial has a result yet."""
 _NOT_CAUSED_BY_TRIAL = (7, 8, 10, STOPPED, INTERRUPTED)
-"""Exit codes of errors that no setting of a trial has caused: missing package, missing device, machine, signal."""
+"""Exit codes that settings of a trial cannot cause: missing package, missing device, error of the machine, signals."""
 
 
 def check_parameters(request: TrainingRequest, parameters: Sequence[Parameter], objective: Objective) -> Resolved:
     """Check, before anything is written, that trials can be trained and evaluated.
 
-    Every bound and every choice of the parameters is tried in a configuration.
+    Every bound and every choice of the parameters is checked in a configuration of the task.
 
     Args:
         request: the request for the trainings.
-        parameters: the varied settings.
+        parameters: the keys that the sweep varies, with their ranges or choices.
         objective: the metric that ranks the trials.
 
     Returns:
-        A configuration with bounds of the parameters, which has the task and the agent of all trials.
+        A configuration with the task and the agent of all trials; each parameter has one of its bounds or choices.
 
     Raises:
         ConfigError: for an unknown key, or a bound that is not valid for its key.
@@ -62,16 +62,20 @@ def check_parameters(request: TrainingRequest, parameters: Sequence[Parameter], 
     groups: dict[str, Mapping[str, Any]] = {"reward_terms": task.rewards, "terminations": task.terminations}
     names = [key for key, term in groups.get(group, {}).items() if term is not None]
     if names and name not in names:
-        hint = did_you_mean(name, names) or f"its terms: {listing(names)}"
+        hint = did_you_mean(name, names) or f"choose from {listing(names)}"
         kind = "reward" if group == "reward_terms" else "termination"
         raise UsageError(f"--objective {objective.key}: the task has no {kind} '{name}'", hint=hint)
     return resolved
 
 
 def write_preset(sweep: Sweep, request: TrainingRequest) -> None:
-    """Write the settings of the best trial into the sweep's folder, as a file for `rlcli train --config`."""
+    """Write the settings of the best trial into the sweep's folder, as a file for `rlcli train --config`.
+
+    Nothing is written if no trial is finished.
+    """
 
     def preset(values: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the content of the file for the values (key -> value) of a trial."""
         resolved, _ = replace(request, budget={}).resolve(sweep.overrides(values))
         return preset_of(resolved, names_agent=True)
 
@@ -80,26 +84,30 @@ def write_preset(sweep: Sweep, request: TrainingRequest) -> None:
 
 @dataclass(slots=True)
 class _Stage:
-    """Running part of a trial: its training, or later its evaluation, in a subprocess."""
+    """Stage of a trial (first training, then evaluation) that runs in a subprocess."""
 
     trial: Trial
     process: TrainingProcess
     evaluates: bool = False
+    """Whether the stage is the evaluation."""
     pruned: bool = False
+    """Whether the pruner has stopped the training."""
     reported: int = 0
-    """Last step of the pruner that was reported."""
+    """Last step reported to the pruner, in percent of the budget."""
     next_report: float = 0.0
     """Time of the next report to the pruner [s], by `time.monotonic`."""
     trained_s: float = 0.0
     """Training time (rollouts and updates) so far [s]."""
     counted: int = 0
-    """Iterations that are included in `trained_s`."""
+    """Number of iterations that are included in `trained_s`."""
 
     def add_trained_time(self, rows: Sequence[Mapping[str, Any]]) -> float:
         """Add the durations in rows of `metrics.jsonl` that are not counted yet; return the training time so far [s].
 
+        If earlier rows are missing in `rows`, the duration in the run's record is used, if larger.
+
         Args:
-            rows: the newest rows, the oldest first.
+            rows: the newest rows, in the order of the iterations.
         """
         new_rows = [row for row in rows if row["iteration"] > self.counted]
         if new_rows and new_rows[0]["iteration"] > self.counted + 1:  # rows were missed, or the run was resumed
@@ -111,7 +119,15 @@ class _Stage:
 
 
 class TrialRunner:
-    """Runner of trials of a sweep: it trains and evaluates them in subprocesses, and stores their results."""
+    """Trains and evaluates trials of a sweep in subprocesses, and stores their results.
+
+    Args:
+        sweep: the sweep.
+        request: the request for the trainings.
+        objective: the metric that ranks the trials, and the limit of their training.
+        jobs: number of trials at a time.
+        stop: stores whether a signal has asked to stop.
+    """
 
     def __init__(
         self, sweep: Sweep, request: TrainingRequest, objective: Objective, jobs: int, stop: StopRequest
@@ -121,10 +137,11 @@ class TrialRunner:
         self._failures: list[RlcliError] = []
 
     def run(self) -> None:
-        """Run trials until none is left or a signal arrives.
+        """Run trials until no trial is left or a signal arrives.
 
         Raises:
-            RlcliError: if the first trials all fail, or for an error that no trial has caused (a full disk).
+            RlcliError: if all trials have failed, or the first three; or for an error that does not depend on the
+                trial, such as a full disk.
         """
         before = len(self._sweep.ended())
         try:
@@ -137,7 +154,10 @@ class TrialRunner:
             raise self._all_failed()
 
     def _run_all(self, on_end: Callable[[], None]) -> bool:
-        """Run trials; `on_end` is called after each stage of a trial. Return whether a signal has stopped them."""
+        """Run the trials, and return whether a signal has stopped them.
+
+        `on_end` is called after each stage (training, evaluation) of a trial.
+        """
         while True:
             stopping = self._stop.signal is not None
             while not stopping and len(self._active) < self._jobs:
@@ -159,7 +179,7 @@ class TrialRunner:
             time.sleep(POLL_S)
 
     def _start(self, trial: Trial) -> _Stage:
-        """Start or resume the training of a trial, or start the evaluation of a trained one."""
+        """Start or resume the training of a trial; if the training is finished, start the evaluation."""
         changes = self._sweep.overrides(trial.values)
         _log.info("trial %s: %s", trial.number, ", ".join(changes))
         device = prepare_run(trial.folder, self._request, changes)
@@ -170,12 +190,13 @@ class TrialRunner:
         return _Stage(trial, start_training(trial.folder, device))
 
     def _evaluate(self, trial: Trial) -> _Stage:
+        """Start the evaluation of a trial, with `rlcli eval`."""
         episodes, seed = self._sweep.settings["episodes"], self._sweep.settings["seed"]
         words = ["eval", "--checkpoint", str(trial.folder), "--episodes", str(episodes), "--seed", str(seed)]
         return _Stage(trial, start_command(trial.folder, words), evaluates=True)
 
     def _watch(self, stage: _Stage) -> None:
-        """Stop a training that has reached its time limit, or that is pruned because it learns worse than others."""
+        """Report the progress of a training to the pruner, and stop the training if it is pruned or out of time."""
         if stage.evaluates or stage.process.stop_requested:
             return
         now, limit_s, metric = time.monotonic(), self._objective.seconds, self._objective.training_metric
@@ -204,13 +225,19 @@ class TrialRunner:
             stage.process.stop()
 
     def _end(self, stage: _Stage, stopping: bool) -> None:
-        """Handle a process that has ended: evaluate a trained trial; store the result of an evaluated or failed one."""
+        """Handle the end of a process: after a training, start the evaluation; else store the trial's result or error.
+
+        `stopping` says whether a signal has stopped the process; the trial can then be resumed.
+
+        Raises:
+            RlcliError: for an error that does not depend on the trial, such as a full disk.
+        """
         trial, process = stage.trial, stage.process
         if stage.evaluates and process.exit_code == 0:
             self._store_value(trial, self._objective.read(process.document))
         elif stage.pruned:
             self._sweep.tell(trial, state="PRUNED")
-            _log.info("trial %s: stopped by the pruner, because it learns worse than others", trial.number)
+            _log.info("trial %s: pruned (stopped early, because other trials learn better)", trial.number)
         elif stopping:
             return  # the trial stays in the storage, to be resumed
         elif not stage.evaluates and not process.has_failed:
@@ -224,6 +251,7 @@ class TrialRunner:
             self._fail(trial, process.error())
 
     def _store_value(self, trial: Trial, value: float) -> None:
+        """Store the objective of an evaluated trial, and write the preset; a value that is not finite is a failure."""
         if not math.isfinite(value):
             self._fail(trial, DivergedError(f"{self._objective.key} is not finite in the evaluation"))
             return
@@ -234,6 +262,7 @@ class TrialRunner:
         write_preset(self._sweep, self._request)
 
     def _fail(self, trial: Trial, error: RlcliError) -> None:
+        """Store that a trial has failed; raise an error if `_MAX_FAILURES` trials have failed and none has a result."""
         self._failures.append(error)
         self._sweep.tell(trial, state="FAIL", why=error.message)
         _log.warning("trial %s: %s", trial.number, error.message)
@@ -241,6 +270,7 @@ class TrialRunner:
             raise self._all_failed()
 
     def _all_failed(self) -> RlcliError:
+        """Return the error of the last failed trial, with the number of failed trials in its message."""
         error, count = self._failures[-1], len(self._failures)
         error.message = f"the first {f'{count} trials' if count > 1 else 'trial'} failed: {error.message}"
         return error

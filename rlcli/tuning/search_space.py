@@ -32,10 +32,15 @@ class Parameter:
     """Setting that a sweep varies: a key of the configuration, and the range or the choices of its values."""
 
     key: str
+    """Dotted key of the configuration, such as `agent.learning_rate`."""
     low: float | int | None = None
+    """Lower end of the range; None: the parameter has choices."""
     high: float | int | None = None
+    """Upper end of the range (inclusive); None: the parameter has choices."""
     log: bool = False
+    """Whether the logarithm of the value is searched."""
     choices: tuple[Any, ...] = ()
+    """The allowed values; empty: the parameter has a range."""
 
     @property
     def bounds(self) -> tuple[Any, ...]:
@@ -47,20 +52,20 @@ class Parameter:
         return f"{self.key}={_to_line(value)}"
 
     def suggest(self, trial: optuna.Trial) -> Any:
-        """Return the value that Optuna suggests for a trial."""
+        """Return the value that Optuna suggests for a trial (its type is that of the range's ends or of the choice)."""
         if self.choices:  # Optuna stores only scalars, so choices are stored as YAML text
             return self.value(trial.suggest_categorical(self.key, [_to_line(choice) for choice in self.choices]))
         suggest = trial.suggest_int if isinstance(self.low, int) else trial.suggest_float
         return suggest(self.key, *self.bounds, log=self.log)
 
     def is_valid(self, stored: object) -> bool:
-        """Return whether a stored value is one of the choices, or a number of the range."""
+        """Return whether a value that Optuna has stored is one of the choices (as YAML) or a number in the range."""
         if self.choices:
             return stored in [_to_line(choice) for choice in self.choices]
         return type(stored) in (int, float) and self.low <= stored <= self.high  # type: ignore[operator]
 
     def value(self, stored: Any) -> Any:
-        """Convert the value that Optuna has stored for a trial (a choice is stored as text)."""
+        """Return the value of a trial from what Optuna has stored: a number, or YAML text for a choice."""
         if not self.choices:
             return stored
         return self.choices[[_to_line(choice) for choice in self.choices].index(stored)]
@@ -71,14 +76,14 @@ class Objective:
     """Metric by which trials are ranked, and the length of each trial's training."""
 
     key: str
-    """Entry in the document of `rlcli eval`: success, return, length, reward_terms.NAME or terminations.NAME."""
+    """Entry in the JSON document of `rlcli eval`: success, return, length, reward_terms.NAME or terminations.NAME."""
     seconds: float | None = None
-    """Time after which training is stopped [s]."""
+    """Training time after which a training is stopped [s]; None: no limit."""
     steps: int | None = None
-    """Environment steps after which training ends."""
+    """Number of environment steps after which a training ends; None: the agent's budget."""
 
     def read(self, document: Mapping[str, Any]) -> float:
-        """Return the metric from the JSON document of `rlcli eval`; NaN if it was not finite.
+        """Return the metric from the JSON document of `rlcli eval`; NaN if the document has null as its value.
 
         Raises:
             UsageError: if the document does not have the metric.
@@ -95,15 +100,15 @@ class Objective:
 
     @property
     def training_metric(self) -> str | None:
-        """Metric of a running training that the pruner compares: return or success; None: trials are not pruned."""
+        """Metric of a training that the pruner compares (`return` or `success`); None: trials are not pruned."""
         return self.key if self.key in ("return", "success") else None
 
 
 def read_parameters(texts: Sequence[str]) -> list[Parameter]:
-    """Parse the repeated option `--param`.
+    """Parse the values of the repeated option `--param`: `KEY=LOW:HIGH`, `KEY=log:LOW:HIGH` or `KEY=A,B,C`.
 
     Raises:
-        UsageError: for a wrong form, an empty range, or a repeated key.
+        UsageError: for another form, an empty range, fewer than two choices, or a repeated key.
     """
     found = [_read(text) for text in texts]
     keys = [parse_address(parameter.key) for parameter in found]
@@ -116,16 +121,18 @@ def read_parameters(texts: Sequence[str]) -> list[Parameter]:
 def read_objective(text: str) -> Objective:
     """Parse the option `--objective`, such as `success@30s`, `return@2e6steps` or `return`.
 
+    After `@` is the limit of the training: seconds, or environment steps.
+
     Raises:
-        UsageError: for another metric, or a limit that is not a number above 0.
+        UsageError: for another metric, or a limit that is not a number between 0 and 1e12.
     """
     found = _OBJECTIVE.fullmatch(text)
     number = float(found[2] or 1.0) if found else 0.0
     if found is None or not 0.0 < number < 1e12:
         raise UsageError(
             f"--objective '{text}' is not valid",
-            hint="write return, success, length, reward_terms.NAME or terminations.NAME, optionally with a time:"
-            " success@30s (after 30 s of training) or success@2e6 (after 2,000,000 steps)",
+            hint="write return, success, length, reward_terms.NAME or terminations.NAME, optionally with a length of"
+            " training: success@30s (after 30 s of training) or success@2e6 (after 2,000,000 steps)",
         )
     if found[2] is None:
         return Objective(found[1])
@@ -133,10 +140,11 @@ def read_objective(text: str) -> Objective:
 
 
 def _read(text: str) -> Parameter:
+    """Parse one value of the option `--param`; see `read_parameters` for the errors."""
     key, equals, ranges = text.partition("=")
     key = key.strip()
     if not equals or not key or not ranges.strip():
-        raise UsageError(f"--param '{text}' has no range", hint=HINT)
+        raise UsageError(f"--param '{text}' has no key or no values", hint=HINT)
     try:
         parse_override(f"{key}=0")
     except ConfigError as error:
@@ -159,6 +167,7 @@ def _read(text: str) -> Parameter:
 
 
 def _choices(text: str, key: str, words: str) -> Parameter:
+    """Parse the choices `A,B,C` of a key; `text` is the whole value of the option, for messages."""
     choices = _load(text, f"[{words}]")
     if not isinstance(choices, list) or len(choices) < 2:
         raise UsageError(f"--param '{text}' has fewer than two choices", hint=HINT)
@@ -169,7 +178,7 @@ def _choices(text: str, key: str, words: str) -> Parameter:
 
 
 def _load(text: str, value: str) -> Any:
-    """Read a value of the option `--param` (whose text is for messages) as YAML."""
+    """Parse a number or a list as YAML; `text` is the whole value of the option `--param`, for messages."""
     try:
         return strict_yaml.load_value(value)
     except YamlError as error:
@@ -177,7 +186,7 @@ def _load(text: str, value: str) -> Any:
 
 
 def _to_line(value: object) -> str:
-    """Return a value as YAML on one line."""
+    """Return a value as YAML on one line; lists, mappings and long text as JSON, which is YAML too."""
     text = to_yaml({"v": value})
     if isinstance(value, list | dict) or "\n" in text.strip():
         import json

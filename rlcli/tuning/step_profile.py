@@ -1,7 +1,4 @@
-"""Profile of an environment step: the time of each of its stages, and of each term.
-
-`rlcli bench --profile` prints it.
-"""
+"""Profile of an environment step for `rlcli bench --profile`: the time of each stage of the step, and of each term."""
 
 from __future__ import annotations
 
@@ -25,30 +22,32 @@ from rlcli.managers.term_binding import BoundTerm
 _WARM_UP = 32
 """Number of steps before the measurement starts; also the smallest number of measured steps."""
 _Stage = tuple[str, list[Callable[..., Any]], list[tuple[str, Callable[..., Any]]]]
-"""A stage of the step: its name, its methods, and its terms as (name, function)."""
+"""Stage of the step: name, methods whose time is the stage's time, and its terms as (name, function)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Cost:
-    """Time that one part of an environment step takes.
-
-    `section` is a stage of the step, such as `rewards`. `term` is the name of one of its terms, or several names
-    (`a, b`) of terms that share a function; None: the row is for the whole stage.
-    """
+    """Time that a part of an environment step takes."""
 
     section: str
+    """Stage of the step, such as `rewards`."""
     term: str | None
+    """Name of a term of the stage, or several names (`a, b`) of terms that share a function; None: the whole stage."""
     milliseconds: float
-    """Mean per environment step [ms]."""
+    """Mean time per step of all environments [ms]."""
     share: float
-    """Fraction of the step."""
+    """Share of the time of the whole step, from 0 to 1."""
 
 
 def profile_step(resolved: Resolved, seconds: float) -> list[Cost]:
-    """Run a task with random actions for some seconds, and return the time of each stage of a step and of each term.
+    """Step a task with random actions for some seconds, and return the time of each stage of a step and of each term.
 
-    The times come from Python's profiler, which makes short functions look slower than they are: compare terms only
-    with each other. Terms of one section that share a function have one row.
+    Each stage is followed by its terms, the slowest first; the last row is the rest of the step. The times come from
+    Python's profiler, which makes short functions look slower than they are: compare terms only with each other.
+
+    Args:
+        resolved: configuration of the task.
+        seconds: duration of the measurement [s].
     """
     env = make_env(resolved, seed=0)
     try:
@@ -77,6 +76,7 @@ def _run(env: VecEnv, actions: torch.Tensor, seconds: float) -> int:
 
 
 def _costs(env: VecEnv, times: dict[CodeType | str, float]) -> list[Cost]:
+    """Return the rows of the profile; `times` has the mean time of each function per step [ms], by its code object."""
     whole = times[type(env).step.__code__]
     costs, stages = [], 0.0
     for section, methods, terms in _stages(env):
@@ -94,7 +94,7 @@ def _costs(env: VecEnv, times: dict[CodeType | str, float]) -> list[Cost]:
 
 
 def _stages(env: VecEnv) -> Iterator[_Stage]:
-    """Yield the stages of an environment step in their order: (name, its methods, its terms)."""
+    """Yield the stages of a step of the environments, in their order."""
     kind: type[Any] = type(env)
     middle: list[_Stage]
     last: list[_Stage]
@@ -137,6 +137,7 @@ def _stages(env: VecEnv) -> Iterator[_Stage]:
 
 
 def _calls(terms: list[BoundTerm]) -> list[tuple[str, Any]]:
+    """Return (name, function) of each term."""
     return [(term.name, term.call) for term in terms]
 
 

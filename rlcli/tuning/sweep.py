@@ -1,7 +1,7 @@
 """Sweeps: search for good settings of a task or agent with Optuna.
 
-A trial is one training with one choice of values, and a run in the sweep's folder. Any number of processes share the
-trials of a sweep.
+A trial is a training with certain values of the varied settings; its run is in the sweep's folder. Any number of
+processes can run trials of the same sweep at the same time.
 """
 
 from __future__ import annotations
@@ -35,16 +35,16 @@ PRESET = "best.yaml"
 PICTURE = "sweep.svg"
 _SWEEP_LOCK, _TRIAL_LOCK = ".sweep", ".worker"
 _SETTINGS = "rlcli"
-"""Name of the Optuna study's attribute that stores the settings of the sweep, equal in all processes."""
+"""Name of the user attribute of Optuna's study that stores the settings of the sweep."""
 _LOCATION = "place"
-"""Name of the trial's attribute that stores machine and folder of its run; only there the trial can be resumed."""
+"""Name of the user attribute of a trial that stores the machine and the folder where the trial can be resumed."""
 _SURPLUS = "surplus"
-"""Name of the attribute that marks a trial beyond `--trials`, which another machine started; it does not count."""
+"""Name of the user attribute of trials to ignore: those beyond `--trials`, which another machine started meanwhile."""
 _ENDED = ("COMPLETE", "PRUNED", "FAIL")
 
 
 class _SweepSettings(FileModel):
-    """Settings of a sweep, as `study.json` and the study's attribute `rlcli` store them."""
+    """Settings of a sweep, as stored in `study.json` and in the user attribute `rlcli` of Optuna's study."""
 
     task: PrintableText
     name: PrintableText
@@ -69,7 +69,7 @@ class _SweepRecord(_SweepSettings):
 
 
 class _TrialNotes(FileModel):
-    """What a sweep stores with a trial: training time [s], environment steps, the error, and reports to the pruner."""
+    """Entries that a sweep stores with a trial: training time [s], environment steps, error, reports to the pruner."""
 
     seconds: float | None = None
     step: Count | None = None
@@ -78,25 +78,25 @@ class _TrialNotes(FileModel):
 
 
 class _FinishedTrial(_TrialNotes):
-    """Entries that Optuna's storage has for a finished trial: its notes, and the value of the objective."""
+    """Entries of a finished trial: those of every trial, and the value of the objective."""
 
     values: tuple[float]
 
 
 @dataclass(slots=True)
 class Trial:
-    """Trial that this process has claimed: while it holds the trial's lock, no other process runs the trial."""
+    """Trial that this process runs: while the process holds the trial's lock, no other process runs the trial."""
 
     number: int
     folder: Path
     trial: optuna.Trial
-    """Optuna's trial."""
+    """Optuna's object for the trial."""
     values: dict[str, Any]
     """Key of a parameter -> value."""
     _lock: FileLock
 
     def release(self) -> None:
-        """Release the trial's lock, so that another process can continue it."""
+        """Release the trial's lock, so that another process can continue the trial."""
         self._lock.release()
 
 
@@ -111,10 +111,10 @@ class Sweep:
     _claimed: dict[int, Trial] = field(default_factory=dict)
 
     def trials(self) -> list[FrozenTrial]:
-        """Return the trials in the order of their numbers, without those that were started beyond the wanted number.
+        """Return the trials in the order of their numbers, without trials beyond the number `--trials`.
 
         Raises:
-            CheckpointError: if the storage holds a result that is no finite number, or a damaged note of a trial.
+            CheckpointError: if the storage holds damaged entries of a trial, such as a result that is not finite.
         """
         trials = [trial for trial in self.study.get_trials(deepcopy=False) if _SURPLUS not in trial.user_attrs]
         for trial in trials:
@@ -125,8 +125,8 @@ class Sweep:
             for parameter in self.parameters:
                 known = parameter.key in trial.params
                 if not (parameter.is_valid(trial.params[parameter.key]) if known else kind is not _FinishedTrial):
-                    message = f"trial {trial.number} has no valid value of {parameter.key}"
-                    raise CheckpointError(f"{self.folder} is corrupt: {message}")
+                    message = f"{self.folder} is corrupt: trial {trial.number} has no valid value of {parameter.key}"
+                    raise CheckpointError(message, hint="choose another --name for a new sweep")
         return trials
 
     def ended(self) -> list[FrozenTrial]:
@@ -134,10 +134,7 @@ class Sweep:
         return [trial for trial in self.trials() if trial.state.name in _ENDED]
 
     def same_objective(self) -> float | None:
-        """Return the objective's value if all finished trials have the same; None if not, or for fewer than two.
-
-        Then the search has nothing to choose from, which the user is warned of.
-        """
+        """Return the objective's value if at least two trials are finished and all have the same value; else None."""
         values = [trial.value for trial in self._finished()]
         return values[0] if len(values) > 1 and len(set(values)) == 1 else None
 
@@ -145,7 +142,7 @@ class Sweep:
         return [trial for trial in self.trials() if trial.state.name == "COMPLETE"]
 
     def best(self) -> FrozenTrial | None:
-        """Return the finished trial with the best objective; None if no trial is finished."""
+        """Return the finished trial with the best objective, of equal ones the first; None if no trial is finished."""
         done = self._finished()
         if not done:
             return None
@@ -153,19 +150,19 @@ class Sweep:
         return better(done, key=lambda trial: (trial.value, -trial.number if better is max else trial.number))
 
     def values(self, trial: FrozenTrial | optuna.Trial) -> dict[str, Any]:
-        """Return the values of a trial's parameters, by their keys in the configuration."""
+        """Return the values of a trial's parameters: dotted key -> value."""
         return {p.key: p.value(trial.params[p.key]) for p in self.parameters if p.key in trial.params}
 
     def overrides(self, values: Mapping[str, Any]) -> list[str]:
-        """Return a trial's values, from `values()`, as overrides: `KEY=VALUE` for each parameter."""
+        """Return a trial's values (the result of `values`) as overrides: `KEY=VALUE` for each parameter."""
         return [p.override(values[p.key]) for p in self.parameters if p.key in values]
 
     def trial_folder(self, number: int) -> Path:
-        """Return the folder of a trial, by its number; the folder is a run."""
+        """Return the folder of the run of a trial, which has the number `number`."""
         return self.folder / f"trial-{number:04d}"
 
     def document(self, trial: FrozenTrial) -> dict[str, Any]:
-        """Return a trial as JSON data: number, state, objective, parameters, run, duration."""
+        """Return a trial as JSON data: number, state, objective, parameters, run, training time, steps, error."""
         folder = self.trial_folder(trial.number)
         return {
             "trial": trial.number,
@@ -179,9 +176,10 @@ class Sweep:
         }
 
     def claim(self) -> Trial | None:
-        """Return a trial for this process to run: an unfinished one whose process has died, or a new one; else None.
+        """Return a trial for this process to run; None if `--trials` trials have started.
 
-        A lock lets one process claim a trial at a time: no trial starts twice, and at most `--trials` trials start.
+        An unfinished trial whose process has ended comes first, then a new trial. Because of locks, a trial runs in
+        only one process, and at most `--trials` trials start.
         """
         with _locked(self.folder / _SWEEP_LOCK):
             for trial in self.trials():
@@ -205,7 +203,8 @@ class Sweep:
                 return None
             lock = self._lock_trial(new.number)
             if lock is None:
-                raise MachineError(f"another process writes to {self.trial_folder(new.number)}; wait for its end")
+                folder = self.trial_folder(new.number)
+                raise MachineError(f"another process writes to {folder}; wait until that process has ended")
             return self._claim(lock, self._with_own_sampler(new))
 
     def tell(self, trial: Trial, value: float | None = None, *, state: str | None = None, **notes: Any) -> None:
@@ -215,7 +214,7 @@ class Sweep:
             trial: the trial.
             value: value of the objective; None for a trial without a result.
             state: state of a trial without a result: `PRUNED` or `FAIL`.
-            notes: further entries, see `_TrialNotes`.
+            notes: entries to store with the trial: `seconds` (training time [s]), `step` (environment steps), `why`.
         """
         for key, note in notes.items():
             trial.trial.set_user_attr(key, note)
@@ -224,7 +223,7 @@ class Sweep:
         trial.release()
 
     def write_preset(self, data: Callable[[Mapping[str, Any]], Mapping[str, Any]]) -> Path | None:
-        """Write the settings of the best trial as a `--config` file, and return the file; None if no trial is finished.
+        """Write a `--config` file with the settings of the best trial; return the file, or None without finished trial.
 
         Args:
             data: returns the content of the file for a trial's values (key -> value).
@@ -242,23 +241,25 @@ class Sweep:
         return self.folder / PRESET
 
     def release(self) -> None:
-        """Release the locks of this process's unfinished trials, so that other processes can continue them."""
+        """Release the locks of this process's unfinished trials, so that other processes can continue the trials."""
         for trial in self._claimed.values():
             trial.release()
         self._claimed.clear()
 
     @property
     def _here(self) -> str:
+        """`MACHINE:FOLDER` of this process, where its trials can be resumed."""
         return f"{platform.node()}:{self.folder.resolve()}"
 
     def _is_here(self, trial: FrozenTrial) -> bool:
         """Return whether a trial was started in this folder on this machine, so that it can be resumed here.
 
-        Without a database this holds for all trials of the sweep, because their list is a file in the folder.
+        Without a database, all trials of the sweep were started here, because their list is a file in the folder.
         """
         return self.settings["storage"] is None or trial.user_attrs.get(_LOCATION) == self._here
 
     def _lock_trial(self, number: int) -> FileLock | None:
+        """Create the folder of a trial, and return its lock; None if another process holds the lock."""
         folder = self.trial_folder(number)
         with disk_errors(folder):
             folder.mkdir(parents=True, exist_ok=True)
@@ -269,9 +270,9 @@ class Sweep:
         return None
 
     def _with_own_sampler(self, trial: FrozenTrial | optuna.Trial) -> optuna.Trial:
-        """Return Optuna's trial with a sampler of its own, so that its values depend only on seed and trial number.
+        """Return Optuna's object for a trial, which draws values with a sampler of its own.
 
-        Values that the trial has already are kept.
+        The sampler's seed depends only on the sweep's seed and the trial's number. Existing values are kept.
         """
         import optuna
 
@@ -279,6 +280,7 @@ class Sweep:
         return optuna.trial.Trial(self.study, trial._trial_id)
 
     def _claim(self, lock: FileLock, trial: optuna.Trial) -> Trial:
+        """Draw the values of a trial whose lock this process holds, and return the trial."""
         for parameter in self.parameters:
             parameter.suggest(trial)
         taken = Trial(trial.number, self.trial_folder(trial.number), trial, self.values(trial), lock)
@@ -298,9 +300,9 @@ def open_sweep(
     Args:
         folder: the folder of the sweep; created if it does not exist.
         settings: entries of `_SweepSettings`; except for `trials`, they must equal those of the existing sweep.
-        source: entries of `RecordedTask`, by which the task is found again; they must equal those in the folder.
+        source: entries of `RecordedTask`, which say where the task is; they must equal those of the existing sweep.
         parameters: the keys of the task or agent that the sweep varies, with their ranges.
-        storage: URL of a database; None: the file `JOURNAL` in the folder, to which Optuna appends each change.
+        storage: URL of a database for the trials; None: the file `JOURNAL` in the folder.
 
     Raises:
         UsageError: if the folder or the storage holds a sweep with other settings, or another kind of study.
@@ -327,11 +329,12 @@ def open_sweep(
 
 
 def read_sweep(folder: Path, storage: str | None = None) -> Sweep:
-    """Open an existing sweep for reading.
+    """Open an existing sweep for reading; `storage` is the URL of the database with its trials, None if none is used.
 
     Raises:
         CheckpointError: if the sweep does not exist or is damaged.
         MachineError: if its storage cannot be reached.
+        UsageError: if the trials are in a database and `storage` is None.
     """
     settings = _read_record(folder)
     if settings.get("storage") and storage is None:
@@ -356,14 +359,19 @@ def _read_record(folder: Path) -> dict[str, Any]:
 
 
 def find_sweep(words: Sequence[str], runs: Path, storage: str | None) -> Sweep:
-    """Return a sweep by its folder or its name; without a name the newest.
+    """Open a sweep by its folder or its name; without a name, open the newest sweep.
+
+    Args:
+        words: folder or name of the sweep; empty: the newest sweep.
+        runs: folder of all runs.
+        storage: URL of the database with the trials; None: the trials are in the sweep's folder.
 
     Raises:
-        CheckpointError: if there is no such sweep.
+        CheckpointError: if there is no such sweep, or its files are damaged.
         UsageError: for several names, or a name that several sweeps have.
     """
     if len(words) > 1:
-        raise UsageError("more than one sweep is named", hint="give one folder or name of a sweep")
+        raise UsageError("more than one sweep is named", hint="give one folder of a sweep or one name")
     known = sorted(file.parent for file in runs.glob(f"*/sweep-*/{STUDY}"))
     if not words:
         found = sorted(known, key=lambda folder: (folder / STUDY).stat().st_mtime)[-1:]
@@ -372,7 +380,7 @@ def find_sweep(words: Sequence[str], runs: Path, storage: str | None) -> Sweep:
     else:
         found = [folder for folder in known if folder.name in (words[0], f"sweep-{words[0]}")]
     if len(found) > 1:
-        raise UsageError(f"several tasks have a sweep '{words[0]}'", hint=f"name one: {listing(map(str, found))}")
+        raise UsageError(f"several tasks have a sweep '{words[0]}'", hint=f"give a folder: {listing(map(str, found))}")
     if not found:
         hint = f"sweeps: {listing(map(str, known))}" if known else "`rlcli sweep TASK --param ...` starts one"
         raise CheckpointError(f"no sweep{f' {words[0]!r}' if words else ''} in {runs}", hint=hint)
@@ -380,16 +388,16 @@ def find_sweep(words: Sequence[str], runs: Path, storage: str | None) -> Sweep:
 
 
 def draw_sweep(sweep: Sweep) -> Path:
-    """Plot the objective of the trials over each parameter into a file in the sweep's folder; return the file.
+    """Plot the objective over each parameter, one point per trial, into a file in the sweep's folder; return the file.
 
     Raises:
-        UsageError: if no trial is complete yet.
+        UsageError: if no trial is finished yet.
         DependencyError: without matplotlib.
     """
     check_drawing()
     done = [trial for trial in sweep.trials() if trial.state.name == "COMPLETE"]
     if not done:
-        raise UsageError("nothing to plot: no trial of the sweep is complete yet; wait for the first one")
+        raise UsageError("nothing to plot: no trial of the sweep is finished yet; wait for the first one")
     panels = [("trial", [trial.number for trial in done], False)]
     panels += [(p.key, [sweep.values(trial)[p.key] for trial in done], p.log) for p in sweep.parameters]
     values = [trial.value for trial in done if trial.value is not None]  # a finished trial has a value
@@ -398,7 +406,7 @@ def draw_sweep(sweep: Sweep) -> Path:
 
 
 def _require_same(location: object, known: Mapping[str, Any], settings: Mapping[str, Any]) -> None:
-    """Check that the settings of an existing sweep and of this command are equal, except for `--trials`.
+    """Check that the settings of an existing sweep (`known`) and of this command are equal, except for `--trials`.
 
     Raises:
         UsageError: with the settings that differ.
@@ -426,10 +434,11 @@ def _state(name: str | None) -> optuna.trial.TrialState | None:
 
 @contextlib.contextmanager
 def _locked(file: Path) -> Iterator[None]:
+    """Hold the lock `file` during a `with` block; raise `MachineError` if another process holds it for 2 minutes."""
     try:
         lock = FileLock(file).acquire(timeout=120)
     except Timeout:
-        raise MachineError(f"another process uses {file}; wait for its end") from None
+        raise MachineError(f"another process has locked {file}; wait until the process has ended") from None
     except OSError as error:
         raise disk_error(file, error) from error
     with lock:

@@ -1,6 +1,6 @@
-"""Training of one configuration with several seeds (a study), for `rlcli train --seeds`.
+"""Train one configuration with several seeds (a study), for `rlcli train --seeds`.
 
-At the end it writes learning curves that are aggregated over the seeds.
+At the end, learning curves that are aggregated over the seeds are written.
 """
 
 import logging
@@ -39,7 +39,7 @@ class StudyView(AbstractContextManager[Any], Protocol):
     """
 
     def poll(self) -> None:
-        """Update the view if the last update is old enough."""
+        """Update the display, unless the last update was just before."""
 
 
 @dataclass(slots=True)
@@ -51,17 +51,27 @@ class StudyResult:
     runs: list[dict[str, Any]]
     """The seed, the state and the last metrics of each run."""
     together: dict[str, Any] | None = None
-    """Name -> interquartile mean over the seeds with its interval; None if no run has metrics."""
+    """Metric (`return`, `success`) -> last interquartile mean over the seeds (`iqm`), its interval (`low`, `high`) and
+    the number of environment steps (`step`); None if no run has metrics."""
     curves: Path | None = None
+    """CSV file with the learning curves; None: not written."""
     picture: Path | None = None
+    """Picture of the learning curves; None: not written."""
     exit_code: int = 0
-    """The exit code of the first training that failed."""
+    """Exit code of the first training that failed; 0 if no training has failed."""
     stop_code: int | None = None
-    """The exit code of a signal that stopped the study before its end."""
+    """Exit code for the signal that stopped the study before its end; None: not stopped."""
 
 
 def new_study(request: TrainingRequest, resolved: Resolved, device: str, seeds: Sequence[int]) -> Path:
-    """Create the folder of a study with a run for each seed, whose training has not started; return the folder."""
+    """Create and return the folder of a study, with a run for each seed; the trainings are not started.
+
+    Args:
+        request: the request for the trainings.
+        resolved: the configuration of all runs.
+        device: torch device of the trainings.
+        seeds: the seeds.
+    """
     record, config = run_record(request, resolved, device), to_yaml(to_data(resolved))
     folder = create_study(request.runs, resolved.source.name, request.name, config, record, seeds)
     _log.info("study %s: seeds %s", folder, ", ".join(map(str, seeds)))
@@ -93,13 +103,16 @@ def train_seeds(
     """Train the unfinished runs of a study, and write the aggregated curves.
 
     Args:
-        folder: the study.
+        folder: folder of the study.
         device: device of the trainings; None: the device of the study.
         jobs: number of trainings at a time.
-        stop: the request to stop by a signal.
+        stop: stores whether a signal has asked to stop; signals are handled while the trainings run.
         make_view: returns the display of the progress, for a title and the folders of the runs.
-        finished_too: whether finished runs continue too, because they have a new budget.
-        options: further options of each `rlcli train --resume`.
+        finished_too: whether finished runs are continued too, because they have a new budget.
+        options: further options of each `rlcli train --resume`, see `resume_options`.
+
+    Raises:
+        CheckpointError: if the study cannot be read.
     """
     study = read_study(folder)
     runs = runs_of(folder, study)
@@ -115,7 +128,10 @@ def train_seeds(
 
 
 def _summary(folder: Path, task: str, runs: Sequence[Path]) -> StudyResult:
-    """Write the learning curves over all seeds (CSV, picture); return the result with each seed's last metrics."""
+    """Write the learning curves over all seeds (CSV, picture); return the study's result.
+
+    `task` is the name of the task, `runs` are the folders of the runs.
+    """
     rows: list[dict[str, Any]] = []
     for run in map(overview, runs):
         row = {"seed": run.seed, "run": str(run.folder), "state": run.state, "step": run.step}
@@ -143,7 +159,8 @@ def _summary(folder: Path, task: str, runs: Sequence[Path]) -> StudyResult:
 def _csv(lines: dict[str, Line]) -> str:
     """Return CSV with the columns `steps` and NAME, NAME_low, NAME_high (interquartile mean, interval) of each metric.
 
-    The steps are those of the first metric; other metrics are interpolated.
+    `lines` maps the name of a metric to its curve. The steps are those of the first curve; other curves are
+    interpolated.
     """
     import numpy as np
 
@@ -160,7 +177,10 @@ def _csv(lines: dict[str, Line]) -> str:
 
 
 def _picture(folder: Path, curves: list[Curve]) -> Path | None:
-    """Plot the learning curves over all seeds into the study's folder; return the file, None without matplotlib."""
+    """Plot the learning curves over all seeds into the study's folder; return the file.
+
+    None: matplotlib is not installed, or no metric can be plotted.
+    """
     try:
         check_drawing()
     except DependencyError:

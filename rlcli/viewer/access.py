@@ -1,14 +1,14 @@
-"""Origin and Host checks of the web viewer: only its own page, opened on this machine, may connect.
+"""Access control of the web viewer: only the viewer's own page, opened on this machine, may send requests.
 
-Every page that the user's browser has open can reach a server on the loopback interface. But a page cannot forge the
-headers that the browser adds: `Host` (the name it connects to), `Origin` (the page that sends the request) and
-`Sec-Fetch-*`. A request is answered only if these headers name our own page.
+Every page that is open in the user's browser can send requests to a server on the loopback interface. But a page cannot
+change the headers that the browser adds: `Host` (the name of the server), `Origin` (the page that sends the request)
+and `Sec-Fetch-*`. A request is answered only if these headers name the viewer's own page.
 """
 
 from collections.abc import Mapping, Sequence
 
 SOCKETS = ("/ui", "/state")
-"""Paths that accept a WebSocket. `/drop`, through which a browser would load a model, is not one of them."""
+"""Paths that accept a WebSocket; without `/drop`, through which a browser could load a model."""
 
 HEADERS = {
     "Content-Security-Policy": (
@@ -22,17 +22,17 @@ HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "X-Frame-Options": "DENY",
 }
-"""Headers of every response: nothing is loaded from elsewhere, and no other page may embed or read this one."""
+"""Headers of every response: the page loads nothing from other servers, and no other page may embed or read it."""
 
 
 def response_headers(port: int) -> dict[str, str]:
-    """Return the headers of every response of the server at `port`."""
+    """Return the headers (name -> value) that the server at `port` adds to every response."""
     sockets = " ".join(f"ws://{host}" for host in allowed_hosts(port))
     return {name: value.replace("{sockets}", sockets) for name, value in HEADERS.items()}
 
 
 def allowed_hosts(port: int) -> tuple[str, ...]:
-    """Return the `Host` headers that are allowed: those of a browser on this machine or at the end of an SSH tunnel."""
+    """Return the allowed values of the header `Host`: this machine at `port`, also through an SSH tunnel."""
     names = ("localhost", "127.0.0.1")
     return (*(f"{name}:{port}" for name in names), *(names if port == 80 else ()))
 
@@ -42,12 +42,12 @@ def refusal_reason(port: int, path: str, request_headers: Mapping[str, Sequence[
 
     Args:
         port: the port of the server.
-        path: the path of the request, with its query.
+        path: the path of the request, with its query (the part after `?`).
         request_headers: header name in lower case -> its values.
     """
     for name, values in request_headers.items():
         if len(values) > 1 and (name in ("host", "origin", "upgrade") or name.startswith("sec-fetch-")):
-            return f"the header {name} appears twice"
+            return f"the request has the header {name} twice"
     host = [value.lower() for value in request_headers.get("host", ())]
     if not host or host[0] not in allowed_hosts(port):
         return f"the Host header does not name this machine; open http://localhost:{port}/"
@@ -57,7 +57,7 @@ def refusal_reason(port: int, path: str, request_headers: Mapping[str, Sequence[
     upgrades = any("upgrade" in value.lower() for value in request_headers.get("connection", ()))
     is_websocket = upgrades or "upgrade" in request_headers
     if is_websocket and route not in SOCKETS:
-        return "no WebSocket has this path"
+        return "the viewer has no WebSocket at this path"
     origin = [value.lower() for value in request_headers.get("origin", ())]
     own = f"http://{host[0]}"
     # browsers always send Origin with a WebSocket, but not with every request for a page

@@ -1,7 +1,4 @@
-"""Loader of a run's checkpoints for a viewer.
-
-The viewer can switch between checkpoints while the run is still training.
-"""
+"""Loader of the policies of a run's checkpoints, for viewers that switch between checkpoints, also during training."""
 
 from dataclasses import dataclass
 
@@ -17,12 +14,12 @@ from rlcli.runs.run import Run
 
 @dataclass(slots=True)
 class RunCheckpoints:
-    """Loader of the policies of a run's checkpoints, for a viewer that can switch between them.
+    """Loader of the policies of a run's checkpoints, for a viewer that can switch between checkpoints.
 
     Args:
         run: the run.
-        env: the environment.
-        stochastic: whether the policies sample their actions.
+        env: the environments in which the policies act.
+        stochastic: whether the policies sample their actions; otherwise the mean of the distribution is the action.
         seed: seed of the sampled actions.
     """
 
@@ -32,28 +29,32 @@ class RunCheckpoints:
     seed: int = 0
 
     def steps(self) -> list[int]:
-        """Return the steps of the existing checkpoints, ascending; an empty list if the folder was removed."""
+        """Return the existing checkpoints, each by its number of environment steps, ascending; empty without folder."""
         try:
             return steps(self.run.checkpoints)
         except OSError:
             return []
 
     def load(self, step: int) -> Act:
-        """Return the policy of the checkpoint at a step, as a function from observations to actions.
+        """Return the policy of a checkpoint, as a function: observations (num_envs, d) -> actions (num_envs, a).
 
-        The hidden state of a recurrent policy is reset.
+        A recurrent policy starts with hidden state 0.
+
+        Args:
+            step: number of environment steps of the checkpoint, from `steps`.
 
         Raises:
             CheckpointError: if the checkpoint was removed, is corrupt, or belongs to another task.
         """
         folder = self.run.checkpoints / f"{step:012d}"
         if step not in self.steps():
-            raise CheckpointError(f"{folder} was deleted; choose a newer checkpoint")
+            raise CheckpointError(f"{folder} does not exist (training deletes old checkpoints); choose a newer one")
         try:
             checkpoint = open_checkpoint(folder)
             policy = checkpoint.policy()
             require_fit(checkpoint, self.env.layout)
         except OSError as error:  # the training has removed the checkpoint while it was read
-            raise CheckpointError(f"{folder} cannot be read: {error.strerror or error}; choose another") from None
+            message = f"{folder} cannot be read: {error.strerror or error}; choose another checkpoint"
+            raise CheckpointError(message) from None
         generator = torch.Generator().manual_seed(self.seed)
         return trained_policy(self.env, policy, stochastic=self.stochastic, generator=generator)

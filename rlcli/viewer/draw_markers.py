@@ -1,7 +1,4 @@
-"""Drawing of a task's markers (arrows, frames, spheres such as goals) as geoms of a MuJoCo scene.
-
-All viewers and videos use it.
-"""
+"""Drawing of a task's markers (such as a sphere at a goal) as geoms of a MuJoCo scene, for viewers and videos."""
 
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
@@ -19,32 +16,33 @@ _ARROW, _SPHERE = int(mujoco.mjtGeom.mjGEOM_ARROW), int(mujoco.mjtGeom.mjGEOM_SP
 _CYLINDER = int(mujoco.mjtGeom.mjGEOM_CYLINDER)
 _AXES: tuple[Color, ...] = ((0.9, 0.1, 0.1, 1.0), (0.1, 0.9, 0.1, 1.0), (0.1, 0.3, 1.0, 1.0))
 _EMISSION = 0.4
-"""Emitted light of markers, so that their colours are visible in the dark."""
+"""Emitted light (emission of the geom) of markers, so that their colours are visible in a dark scene."""
 
 
 class _Part(NamedTuple):
-    """Arrow, cylinder or sphere of a marker, in every environment.
-
-    It goes from the points `start` to the points `end`, (num_envs, 3) [m] each; for a sphere both are its centre.
-    """
+    """Arrow, cylinder or sphere of a marker, in every environment."""
 
     kind: int
+    """Geom type, `mjtGeom`."""
     start: Tensor
+    """Start of the arrow or cylinder, or centre of the sphere, world frame. (num_envs, 3) [m]"""
     end: Tensor
+    """End of the arrow or cylinder, or centre of the sphere, world frame. (num_envs, 3) [m]"""
     radius: float
+    """[m]"""
     color: Color
 
 
 def add_markers(
     scene: mujoco.MjvScene, markers: Iterable[Marker], numbers: Sequence[int], offsets: NDArray[np.float64]
 ) -> None:
-    """Append the markers of some environments to a scene until it is full.
+    """Append the markers of some environments to a scene, as far as the scene has space for geoms.
 
     Args:
         scene: the scene, which may contain other geoms.
         markers: markers of all environments.
         numbers: indices of the environments whose markers are drawn.
-        offsets: displacement of each of these environments in the image from its world position. (len(numbers), 3) [m]
+        offsets: vector by which each of these environments is moved in the image. (len(numbers), 3) [m]
     """
     for marker in markers:
         for part in _parts(marker):
@@ -56,6 +54,7 @@ def add_markers(
 
 
 def _parts(marker: Marker) -> list[_Part]:
+    """Return the geoms of a marker: an arrow, a sphere, or for a frame three cylinders along its axes."""
     if isinstance(marker, Arrow):
         return [_Part(_ARROW, marker.start, marker.end, marker.radius, marker.color)]
     if isinstance(marker, Sphere):
@@ -66,15 +65,18 @@ def _parts(marker: Marker) -> list[_Part]:
 
 
 def _points(tensor: Tensor, numbers: Sequence[int]) -> NDArray[np.float64]:
+    """Return the rows `numbers` of a tensor as an array. (len(numbers), 3)"""
     return tensor.detach()[list(numbers)].to("cpu", torch.float64).numpy()
 
 
 def _is_visible(part: _Part, start: NDArray[np.float64], end: NDArray[np.float64]) -> bool:
+    """Return whether a geom is drawn: not with NaN, and not an arrow or cylinder that is shorter than its radius."""
     length = np.linalg.norm(end - start)  # NaN hides a marker
     return bool(np.isfinite(length) and (part.kind == _SPHERE or length > part.radius))
 
 
 def _fill_geom(geom: mujoco.MjvGeom, part: _Part, start: NDArray[np.float64], end: NDArray[np.float64]) -> None:
+    """Set all fields of a geom of a scene to an arrow, cylinder or sphere from `start` to `end`. (3,) [m] each"""
     mujoco.mjv_initGeom(
         geom, part.kind, np.full(3, part.radius), start, np.eye(3).ravel(), np.array(part.color, np.float32)
     )

@@ -1,7 +1,4 @@
-"""Grid of several environments in one image: the shown environment and those with the next indices.
-
-Viewers and videos draw it, with the markers of each environment.
-"""
+"""Grid of several environments in one image of a viewer or video: the shown environment and the next ones by index."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -22,27 +19,27 @@ _FIELDS = [name for name in dir(mujoco.MjvGeom) if not name.startswith("_")]
 
 @dataclass(frozen=True, slots=True)
 class EnvGrid:
-    """Environments that are drawn together in one image, on a grid with the task's `env_spacing`.
+    """Environments that are drawn together in an image, on a grid with the task's `env_spacing`.
 
-    `shown` is the index of the shown environment: the first one of the image. The environments with the next indices
-    follow.
+    In all methods, `shown` is the index of the shown environment, the first one of the grid. The environments with the
+    next indices follow.
 
     Args:
         env: the environments.
-        count: number of environments in the image, with the shown one.
+        count: number of environments in the image, including the shown one.
     """
 
     env: VecEnv
     count: int
 
     def others(self, shown: int) -> list[int]:
-        """Return the indices of the `count - 1` environments after the shown one; 0 follows the last index."""
+        """Return the indices of the other environments in the image, `count` - 1; 0 follows the last index."""
         return [(shown + number) % self.env.num_envs for number in range(1, self.count)]
 
     def offsets(self) -> NDArray[np.float64]:
-        """Return the displacement of each environment of the image from its world position. (count, 3) [m]
+        """Return the vector by which each environment is moved in the image. (count, 3) [m]
 
-        On terrain they are 0: all environments are on one terrain, at different positions.
+        With a terrain, the vectors are 0: the environments are already at different positions of the same terrain.
         """
         if self.env.terrain is not None:
             return np.zeros((self.count, 3))
@@ -51,7 +48,10 @@ class EnvGrid:
         return offsets
 
     def fit_camera(self, camera: mujoco.MjvCamera, shown: int = 0) -> mujoco.MjvCamera:
-        """Move a camera that looks at the shown environment so that all environments of the grid are in the image."""
+        """Move a camera that looks at the shown environment, so that all environments of the grid are in the image.
+
+        The camera is changed and returned.
+        """
         positions = self.offsets()
         if self.env.terrain is not None:
             origins = self.env.origins.double().cpu().numpy()
@@ -62,7 +62,13 @@ class EnvGrid:
         return camera
 
     def add(self, scene: mujoco.MjvScene, shown: int, option: mujoco.MjvOption) -> None:
-        """Append the markers and the other environments to a scene that has the shown environment and the ground."""
+        """Append the markers and the other environments to a scene that has the shown environment and the ground.
+
+        Args:
+            scene: the scene.
+            shown: index of the shown environment.
+            option: visualisation options of MuJoCo.
+        """
         add_markers(scene, self.env.markers(), [shown, *self.others(shown)], self.offsets())
         category = _MOVING if self.env.terrain is not None else _MOVING | _FIXED
         for number, offset in zip(self.others(shown), self.offsets()[1:], strict=True):
@@ -95,6 +101,7 @@ class EnvGrid:
 
 
 def _copy(source: mujoco.MjvGeom, target: mujoco.MjvGeom) -> None:
+    """Copy all fields of a geom."""
     for name in _FIELDS:
         value = getattr(source, name)
         if isinstance(value, np.ndarray):

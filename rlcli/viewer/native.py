@@ -1,7 +1,4 @@
-"""Viewer in a window: MuJoCo's own passive viewer, with keyboard controls.
-
-`rlcli play --viewer native` opens it.
-"""
+"""Viewer in a window (`rlcli play --viewer native`): MuJoCo's passive viewer, with keyboard controls."""
 
 import copy
 import sys
@@ -21,7 +18,7 @@ from rlcli.viewer.protocol import REQUEST_KEYS, Ready, View
 
 KEYS = (
     "Space: pause, resume. Right: one step. Backspace: new episodes. - and =: speed. Up, Down: environment."
-    " PageUp, PageDown: newer, older checkpoint. Home, End: choose a command; Insert, Delete: raise, lower it."
+    " PageUp, PageDown: newer, older checkpoint. Home, End: choose a command; Insert, Delete: raise, lower the command."
     " Double click, then Ctrl and drag: push a body"
 )
 _REQUESTS = {code: request for request, (code, _) in REQUEST_KEYS.items()}
@@ -32,7 +29,7 @@ def run(playback: Playback, *, title: str, num_drawn: int, port: int, ready: Rea
     """Play in real time until the window is closed; see `rlcli.viewer.protocol.Viewer`.
 
     Raises:
-        MachineError: if no window opens, as on macOS outside mjpython.
+        MachineError: if no window can be opened, for example without a display, or on macOS without mjpython.
     """
     import mujoco.viewer
 
@@ -67,13 +64,16 @@ def run(playback: Playback, *, title: str, num_drawn: int, port: int, ready: Rea
 
 
 def press(playback: Playback, code: int) -> None:
-    """Submit the request of a pressed key to the playback; other keys do nothing. `code`: the key's code in GLFW."""
+    """Submit the request that belongs to a pressed key to the playback; other keys do nothing.
+
+    `code` is the key's code in GLFW (the window library).
+    """
     if code in _REQUESTS:
         playback.submit(playback.requests()[_REQUESTS[code]])
 
 
 def captions(view: View) -> tuple[str, str]:
-    """Return the two columns of text in the corner of the window: the names, and their values, one per line."""
+    """Return the two columns of text in the corner of the window: names, and their values; one line for each."""
     rows = {
         "speed": "paused" if view.paused else f"{view.speed:g} x",
         "environment": f"{view.shown} of {view.num_envs}",
@@ -97,10 +97,10 @@ def captions(view: View) -> tuple[str, str]:
 
 
 def _require_windows() -> None:
-    """Check that a window can be opened. Without a display, MuJoCo's thread would wait for its window forever.
+    """Check that a window can be opened. Otherwise MuJoCo's thread would wait for the window forever.
 
     Raises:
-        MachineError: if the display cannot show a window.
+        MachineError: if no window can be opened, for example without a display.
     """
     if sys.platform == "darwin":  # on macOS only the main thread may open a window; MuJoCo raises an error otherwise
         return
@@ -122,7 +122,7 @@ def _require_windows() -> None:
 
 
 def _draw(window: Any, playback: Playback, env_grid: EnvGrid, model: mujoco.MjModel, data: mujoco.MjData) -> None:
-    """Copy the shown environment into the MjData of the window, and redraw."""
+    """Copy the state of the shown environment into `data`, which the window shows, and redraw the window."""
     _, now = playback.env.world(playback.shown)
     with window.lock():
         mujoco.mj_copyData(data, model, now)
@@ -134,7 +134,7 @@ def _draw(window: Any, playback: Playback, env_grid: EnvGrid, model: mujoco.MjMo
 
 
 def _forces(window: Any, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    """Return the forces and torques with which the user's mouse pulls at the bodies. (nbody, 6) [N, N m]"""
+    """Return the forces and torques on the bodies from the user's mouse, world frame. (nbody, 6) [N, N m]"""
     with window.lock():
         data.xfrc_applied[:] = 0.0
         if window.perturb.active:

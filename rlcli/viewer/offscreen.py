@@ -1,6 +1,6 @@
 """Renderer of environments without a window, for videos and for `render()` of Gymnasium environments.
 
-The camera is set in the task's section `viewer`.
+The task's section `viewer` sets the camera and the size of the images.
 """
 
 import contextlib
@@ -20,7 +20,7 @@ _PARALLEL = int(mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
 
 
 def free_camera(viewer: ViewerConfig, origin: Sequence[float] = (0.0, 0.0, 0.0)) -> mujoco.MjvCamera:
-    """Return a camera at `viewer.eye` that looks at `viewer.lookat`, both relative to an environment's origin."""
+    """Return a camera at `viewer.eye` that looks at `viewer.lookat`, both relative to the point `origin`. (3,) [m]"""
     camera = mujoco.MjvCamera()
     mujoco.mjv_defaultFreeCamera(mujoco.MjModel.from_xml_string("<mujoco/>"), camera)
     ray = np.subtract(viewer.lookat, viewer.eye)
@@ -32,12 +32,12 @@ def free_camera(viewer: ViewerConfig, origin: Sequence[float] = (0.0, 0.0, 0.0))
 
 
 class Renderer(contextlib.AbstractContextManager["Renderer"]):
-    """Offscreen renderer of an environment.
+    """Offscreen renderer of environments; used in a `with` block, or closed with `close`.
 
     Args:
-        model: the environment's model.
-        viewer: size of the images [pixels] and camera.
-        env_grid: further environments to draw in the image; None: only one environment.
+        model: the model of the environments.
+        viewer: camera, and size of the images [pixels].
+        env_grid: environments to draw together in each image; None: only one environment.
 
     Raises:
         MachineError: if this machine has no OpenGL backend that works.
@@ -60,19 +60,19 @@ class Renderer(contextlib.AbstractContextManager["Renderer"]):
         self._rect = mujoco.MjrRect(0, 0, viewer.width, viewer.height)
 
     def image(self, env: VecEnv, number: int = 0) -> NDArray[np.uint8]:
-        """Render environment `number` with its markers and the other environments of the grid. (height, width, 3)"""
+        """Return an RGB image of environment `number`, or of the grid from it on, with markers. (height, width, 3)"""
         self._compose(*env.world(number), env.origins[number].tolist())
         env_grid = EnvGrid(env, 1) if self._env_grid is None else self._env_grid
         env_grid.add(self._scene, number, self._option)
         return self._pixels()
 
     def draw(self, model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.uint8]:
-        """Render only a model in a state for which `mj_forward` was called. (height, width, 3)"""
+        """Return an RGB image of a model and its state, without markers; `mj_forward` was called. (height, width, 3)"""
         self._compose(model, data, (0.0, 0.0, 0.0))
         return self._pixels()
 
     def _compose(self, model: mujoco.MjModel, data: mujoco.MjData, origin: Sequence[float]) -> None:
-        """Fill the scene from a model and its state, and move the camera to the environment's origin."""
+        """Fill the scene from a model and its state, and move the camera to the origin or the followed body."""
         self._camera.lookat[:] = np.add(self._lookat, origin)
         travelled = np.zeros(3)
         if self._followed is not None:
@@ -86,6 +86,7 @@ class Renderer(contextlib.AbstractContextManager["Renderer"]):
                 light.pos[:2] += travelled[:2]
 
     def _pixels(self) -> NDArray[np.uint8]:
+        """Render the scene and return the RGB image. (height, width, 3)"""
         mujoco.mjr_render(self._rect, self._scene, self._mjr)
         pixels = np.empty((self._height, self._width, 3), np.uint8)
         mujoco.mjr_readPixels(pixels, None, self._rect, self._mjr)
@@ -101,7 +102,7 @@ class Renderer(contextlib.AbstractContextManager["Renderer"]):
 
 
 def followed_body(model: mujoco.MjModel, entity: str | None) -> tuple[int, NDArray[np.float64]] | None:
-    """Return the root body of an entity and its default position [m]; None if there is no such entity."""
+    """Return the id of an entity's root body and its default position, (3,) [m]; None if there is no such entity."""
     bodies = [body for body in range(model.nbody) if model.body(body).name.startswith(f"{entity}/")]
     if entity is None or not bodies:
         return None

@@ -1,7 +1,7 @@
-"""Playback of a policy in an environment in real time, with the controls of a viewer.
+"""Playback of a policy in real time, with the controls of a viewer: the class `Playback`, which all viewers use.
 
-All viewers share this object. The viewer's thread submits requests (`submit`) and reads the state (`view`). The thread
-of the simulation executes the requests between two steps (`advance`), so that nothing changes within a step.
+A viewer may run in a thread of its own: it submits requests (`submit`) and reads a snapshot of the state (`view`). The
+thread of the simulation executes the requests between two steps (`advance`), so that nothing changes within a step.
 """
 
 import logging
@@ -29,21 +29,26 @@ _log = logging.getLogger(__name__)
 SPEEDS = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 """Speeds of a playback, as multiples of real time."""
 _LAG = 0.25
-"""Largest delay behind real time that one call of `advance` makes up for [s]."""
+"""Largest delay behind real time that a call of `advance` makes up for [s]."""
 _FRAME_S = 1.0 / 60.0
+"""Time between two images [s]."""
 _REFRESH_S = 1.0
 """Time between two reads of the list of checkpoints [s]."""
 
 
 @dataclass(slots=True)
 class Playback:
-    """Playback of a policy in real time; the module docstring describes its threads.
+    """Playback of a policy in real time, for a viewer.
+
+    The methods `view`, `submit` and `requests` may be called in any thread, the others only in the simulation's thread.
 
     Args:
-        env: the environment; it is reset when the playback is made, unless `initial_obs` is given.
-        act: the policy, a function from observations to actions.
-        checkpoint_source: checkpoints of the run to switch to; None: there are none.
-        checkpoint: step of the first policy's checkpoint.
+        env: the environments; reset when the playback is made, unless `initial_obs` is given.
+        act: the policy, a function: observations (num_envs, d) -> actions (num_envs, a).
+        checkpoint_source: checkpoints of the run, to which the user can switch; None: no checkpoints.
+        checkpoint: the checkpoint of the first policy, by its number of environment steps; None: no checkpoint.
+        shown: index of the shown environment.
+        speed: speed as a multiple of real time, one of `SPEEDS`.
     """
 
     env: VecEnv
@@ -53,15 +58,17 @@ class Playback:
     shown: int = 0
     speed: float = 1.0
     follow: bool = False
-    """Switch to each new checkpoint as soon as it appears."""
+    """Whether to switch to each new checkpoint when it appears."""
     max_advance_s: float = 0.1
     """Time after which `advance` returns to the viewer, even if steps are still due [s]."""
     longest_s: float | None = None
     """Time after which the viewer closes, by the clock [s]; None: no limit."""
     initial_obs: Tensor | None = None
-    """Current observations of an environment whose episodes continue; None: the environment is reset."""
+    """Current observations of environments whose episodes continue; None: the environments are reset. (num_envs, d)"""
     steps: int = 0
+    """Number of steps made so far; each steps all environments."""
     message: str = ""
+    """Last message for the user, such as that a checkpoint was loaded."""
     _knob: int = 0
     _requests: deque[Callable[[], None]] = field(default_factory=deque)
     _obs: Tensor = field(init=False)
@@ -90,11 +97,11 @@ class Playback:
         return self._view
 
     def submit(self, request: Callable[[], None]) -> None:
-        """Queue a call of a method of this object, such as `reset`; it is executed between two steps."""
+        """Queue a call of a method of this object, such as `reset`; the call is made between two steps."""
         self._requests.append(request)
 
     def requests(self) -> dict[str, Callable[[], None]]:
-        """Return the requests that a viewer's keys and buttons submit, by name."""
+        """Return the requests that a viewer's keys and buttons submit: name -> function for `submit`."""
         view = self._view
         return {
             "pause": partial(self.pause, not view.paused),
@@ -117,7 +124,7 @@ class Playback:
     def advance(self, elapsed: float) -> int:
         """Execute the requests, then make the environment steps that are due; return the number of steps made.
 
-        If the machine is too slow, the playback falls behind real time and does not catch up later.
+        If the machine is too slow, the playback is slower than real time; it does not catch up a delay of over 0.25 s.
 
         Args:
             elapsed: real time since the last call [s].
@@ -138,21 +145,21 @@ class Playback:
         return done
 
     def pause(self, paused: bool = True) -> None:
-        """Pause or resume; `env.is_playing()` is false while it is paused."""
+        """Pause or resume the playback; `env.is_playing()` is false during a pause."""
         self.env.pause(paused)
         self._due = 0.0
 
     def single_step(self) -> None:
-        """Pause, and make one step of the environment."""
+        """Pause, and make one step of the environments in the next `advance`."""
         self.pause()
         self._single += 1
 
     def set_speed(self, speed: float) -> None:
-        """Set the speed to the nearest of `SPEEDS`, on a logarithmic scale."""
+        """Set the speed to the value of `SPEEDS` that is nearest to `speed` on a logarithmic scale."""
         self.speed = min(SPEEDS, key=lambda available: abs(np.log(available / max(speed, 1e-9))))
 
     def change_speed(self, change: int = 1) -> None:
-        """Change the speed to a faster (1) or slower (-1) one of `SPEEDS`."""
+        """Change the speed to the next faster (`change` is 1) or next slower (-1) value of `SPEEDS`."""
         position = SPEEDS.index(self.speed) + change
         self.speed = SPEEDS[max(0, min(position, len(SPEEDS) - 1))]
 
@@ -164,22 +171,29 @@ class Playback:
         self._due = 0.0
 
     def show(self, shown: int) -> None:
-        """Show the environment with an index, which wraps around: -1 is the last environment."""
+        """Show the environment with the index `shown`, modulo the number of environments: -1 is the last one."""
         self.shown = shown % self.env.num_envs
         self.statistics.clear_curves()
         self._push = None
 
     def hold(self, name: str, value: float | None) -> None:
-        """Hold a command of the task (such as `vx`) at a value in all environments; None: the task samples it again."""
+        """Hold a command (such as `vx`) at a value in all environments; None: the task samples the command again.
+
+        Raises:
+            UsageError: for an unknown name, or a value that is not finite.
+        """
         hold_command(self.env, name, value)
 
     def select_command(self, change: int) -> None:
-        """Select the next (1) or previous (-1) command, which `adjust_command` then changes."""
+        """Select the next (`change` is 1) or previous (-1) command, which `adjust_command` then changes."""
         if self._commands is not None and (knobs := self._commands.knobs()):
             self._knob = (self._knob + change) % len(knobs)
 
     def adjust_command(self, change: int) -> None:
-        """Change the selected command by `change` tenths of its range and hold it; outside the range, release it."""
+        """Change the selected command by `change` tenths of its range, and hold the command at the new value.
+
+        If the new value is outside the range, the task samples the command again.
+        """
         if self._commands is None or not (knobs := self._commands.knobs()):
             return
         knob = knobs[self._knob]
@@ -189,7 +203,7 @@ class Playback:
         self.hold(knob.name, round(value, 6) if inside else None)
 
     def refresh_checkpoints(self) -> None:
-        """Read the list of the run's checkpoints again; with `follow`, switch to the newest if the list has changed."""
+        """Read the list of the run's checkpoints again; if `follow` and the list has changed, switch to the newest."""
         if self.checkpoint_source is None:
             return
         before, self._checkpoints = self._checkpoints, tuple(self.checkpoint_source.steps())
@@ -197,7 +211,7 @@ class Playback:
             self._switch_to_newest()
 
     def set_follow(self, follow: bool) -> None:
-        """Set whether each new checkpoint is played as soon as it appears; if so, switch to the newest one now."""
+        """Set whether to switch to each new checkpoint when it appears; if so, switch to the newest checkpoint now."""
         self.follow = follow
         self.refresh_checkpoints()
         if follow:
@@ -208,7 +222,13 @@ class Playback:
             self.switch(self._checkpoints[-1])
 
     def switch(self, step: int) -> None:
-        """Play the checkpoint at a step in the running episodes; if that fails, report it and keep the policy."""
+        """Continue the running episodes with the policy of another checkpoint.
+
+        If the checkpoint cannot be loaded, the policy stays and `message` says why.
+
+        Args:
+            step: number of environment steps of the checkpoint.
+        """
         assert self.checkpoint_source is not None
         try:
             self.act = self.checkpoint_source.load(step)
@@ -220,7 +240,7 @@ class Playback:
         self._report(f"now playing step {step}")
 
     def switch_relative(self, change: int) -> None:
-        """Play the next newer (1) or older (-1) checkpoint."""
+        """Switch to the next newer (`change` is 1) or next older (-1) checkpoint, if there is one."""
         self.refresh_checkpoints()
         if not self._checkpoints:
             return
@@ -231,11 +251,17 @@ class Playback:
             self.switch(chosen[0])
 
     def push(self, forces: np.ndarray | None) -> None:
-        """Apply forces and torques to the bodies of the shown environment until the next call. (nbody, 6) [N, N m]"""
+        """Apply forces and torques to the bodies of the shown environment in each step, until the next call.
+
+        Args:
+            forces: force and torque on each body, world frame; None or values that are not finite: nothing is applied.
+                (nbody, 6) [N, N m]
+        """
         usable = forces is not None and forces.shape == (self.env.engine.model.nbody, 6) and np.isfinite(forces).all()
         self._push = forces.copy() if forces is not None and usable and forces.any() else None
 
     def _step(self) -> None:
+        """Make a step of all environments with the policy's actions, also during a pause."""
         playing = self.env.is_playing()
         self.env.pause(False)
         try:
@@ -252,13 +278,13 @@ class Playback:
         self.steps += 1
 
     def _step_under_force(self, action: Tensor, push: np.ndarray) -> Any:
-        """Make an environment step with the forces that the user applies to bodies in the viewer, then remove them.
+        """Make a step with the forces that the user applies to bodies in the viewer; remove the forces after the step.
 
         Forces that the step itself has set, for example in a reset, stay.
 
         Args:
-            action: actions of all environments.
-            push: force and torque on each body of the shown environment. (nbody, 6) [N, N m]
+            action: actions of all environments. (num_envs, a)
+            push: force and torque on each body of the shown environment, world frame. (nbody, 6) [N, N m]
         """
         row = self.env.engine.field("xfrc_applied")[self.shown]
         before = row.clone()
@@ -269,10 +295,12 @@ class Playback:
         return result
 
     def _report(self, message: str) -> None:
+        """Show a message to the user in the viewer, and log the message."""
         self.message = " ".join(message.split())
         _log.info(message)
 
     def _publish(self) -> None:
+        """Set `view` to a snapshot of the present state."""
         shown, statistics = self.shown, self.statistics
         knobs = () if self._commands is None else tuple(self._commands.knobs())
         self._view = View(
@@ -300,15 +328,13 @@ class Playback:
 
 
 def run_in_real_time(playback: Playback, is_open: Callable[[], bool], draw: Callable[[], None]) -> None:
-    """Run the playback and draw it 60 times a second until the viewer is closed or its `longest_s` are over.
-
-    Viewers use this loop and do not call `Playback.advance`.
+    """Call `Playback.advance` and `draw` up to 60 times a second, until the viewer is closed or `longest_s` is over.
 
     Args:
         playback: environments and policy.
         is_open: returns whether the viewer is still open.
-        draw: renders the present state. It runs in the simulation's thread between two calls of `advance`, so it may
-            read `playback.env`. Another thread of a viewer may read only `playback.view`.
+        draw: renders the present state. This function runs in the simulation's thread between two calls of `advance`,
+            so it may read `playback.env`. Another thread of a viewer may read only `playback.view`.
     """
     before, refreshed = time.perf_counter(), 0.0
     end = math.inf if playback.longest_s is None else before + playback.longest_s
@@ -324,14 +350,14 @@ def run_in_real_time(playback: Playback, is_open: Callable[[], bool], draw: Call
 
 
 def hold_command(env: VecEnv, name: str, value: float | None) -> None:
-    """Hold a command of the task at a value in all environments; None: the task samples it again.
+    """Hold a command (such as `vx`) at a value in all environments; None: the task samples the command again.
 
     Raises:
         UsageError: for an unknown name, or a value that is not finite.
     """
     manager = _commands(env)
     if manager is None:
-        raise UsageError(f"the task has no command '{name}'", hint="leave out --command: the task has no commands")
+        raise UsageError(f"the task has no command '{name}'", hint="leave out --command: this task has no commands")
     manager.hold(name, value)
 
 

@@ -1,4 +1,4 @@
-"""Statistics of a playback for the panels of viewers: rewards of the last seconds, returns, and ends of episodes."""
+"""Statistics of a playback for the panel of a viewer: rewards of the last seconds, returns, and ends of episodes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rlcli.managers.reward import RewardManager
 _SHOWN_S = 5.0
 """Time span of the reward curves [s]."""
 _MAX_POINTS = 150
-"""Largest number of points of a curve; all points are sent to the browser in every frame."""
+"""Largest number of points of a curve; with every image, all points are sent to the browser."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,13 +22,13 @@ class RewardCurves:
     """Rewards of the shown environment over the last seconds, for a plot."""
 
     time_s: tuple[float, ...] = ()
-    """Time of each point relative to now, at most 0 [s]."""
+    """Time of each point before the newest one, at most 0 [s]."""
     values: tuple[tuple[str, tuple[float, ...]], ...] = ()
-    """(name, points) of the reward and of each of its terms, with their weights."""
+    """(name, points) of the reward, then of each reward term multiplied by its weight."""
 
 
 class PlaybackStatistics:
-    """Rewards of the last seconds in one environment, and episodes of all environments, for a viewer's panel."""
+    """Rewards of the last seconds in the shown environment, and ends of episodes in all, for the panel of a viewer."""
 
     def __init__(self, env: VecEnv) -> None:
         self._env = env
@@ -45,7 +45,7 @@ class PlaybackStatistics:
         self._last: dict[int, str] = {}
 
     def add(self, result: StepResult, shown: int) -> None:
-        """Record the result of a step; `shown` is the environment whose rewards are kept."""
+        """Add the result of a step; `shown` is the index of the environment whose rewards are kept for the curves."""
         self._steps += 1
         self.returns += result.reward.cpu()
         if self._steps % self._every == 0:
@@ -65,15 +65,15 @@ class PlaybackStatistics:
             self._last[env_id] = ", ".join(parts)
 
     def last_episode(self, env_id: int) -> str:
-        """Return the return, length and end of an environment's last episode as text; empty before its first end."""
+        """Return text about an environment's last episode: return, length, causes of its end; empty without one."""
         return self._last.get(env_id, "")
 
     def clear_curves(self) -> None:
-        """Clear the reward curves, because another environment is shown."""
+        """Clear the reward curves; called when another environment is shown."""
         self._rows.clear()
 
     def clear_returns(self) -> None:
-        """Clear returns and reward curves, because every environment starts a new episode."""
+        """Clear returns and reward curves; called when every environment starts a new episode."""
         self.returns.zero_()
         self.clear_curves()
 

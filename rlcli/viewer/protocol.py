@@ -1,4 +1,4 @@
-"""Interfaces between viewers and playback: table of viewers, protocol of a viewer, and the state that viewers show.
+"""Interface between viewers and playback: the table of viewers, the protocol of a viewer, and the state that it shows.
 
 A new viewer is a module in this folder with a function of the protocol `Viewer`, and a line in `VIEWERS`. The section
 "A viewer" of CONTRIBUTING.md lists the other places that name the viewers.
@@ -18,21 +18,21 @@ if TYPE_CHECKING:
 VIEWERS = {"native": "rlcli.viewer.native:run", "web": "rlcli.viewer.web:run"}
 """Name of a viewer -> import path of the function that runs it."""
 DEFAULT_PORT = 8080
+"""Port of the web viewer."""
 REQUEST_KEYS: dict[str, tuple[int, str | None]] = {
     "pause": (32, "Space"), "step": (262, "RightArrow"), "reset": (259, "Backspace"), "slower": (45, "Minus"),
     "faster": (61, "Equal"), "next environment": (265, "UpArrow"), "previous environment": (264, "DownArrow"),
     "newer checkpoint": (266, "PageUp"), "older checkpoint": (267, "PageDown"), "previous command": (268, None),
     "next command": (269, None), "raise command": (260, None), "lower command": (261, None),
 }  # fmt: skip
-"""Name of a request to the playback -> its key: code in GLFW (native window), name in Dear ImGui (browser; None: no
-key).
+"""Name of a request (see `Playback.requests`) -> its key: the key's code in GLFW, for the window, and its name in Dear
+ImGui, for the browser (None: no key).
 
-A viewer with other key codes has its own table in its module. The names of the requests are those of
-`Playback.requests`.
+A viewer with other key codes has a table of its own in its module.
 """
 
 Ready = Callable[[Sequence[str], str | None], None]
-"""Type of the callback `ready`: it receives lines of instructions for the user, and the viewer's URL, or None."""
+"""Type of the callback `ready`, which takes lines of instructions for the user, and the viewer's URL, or None."""
 
 
 class Viewer(Protocol):
@@ -41,15 +41,15 @@ class Viewer(Protocol):
     def __call__(self, playback: Playback, *, title: str, num_drawn: int, port: int, ready: Ready) -> None:
         """Show the playback in real time.
 
-        A viewer lets `KeyboardInterrupt` through: Ctrl-C ends the command. A viewer writes nothing to stdout, which is
-        for results; the caller prints the lines that `ready` receives.
+        A viewer does not catch `KeyboardInterrupt`, because Ctrl-C ends the command. A viewer writes nothing to stdout,
+        which is for results; the caller prints the lines that `ready` receives.
 
         Args:
             playback: environments and policy.
             title: task and run, for the user.
             num_drawn: number of environments in the image: the shown one and those after it (`EnvGrid.others`).
-            port: port on the loopback interface; 0: any free port. A viewer that is not a server ignores it.
-            ready: the viewer calls it once, when it is open and before it renders the first image.
+            port: port on the loopback interface; 0: any free port. Only for a viewer that is a server.
+            ready: callback that the viewer calls once, when the viewer is open and before the first image.
 
         Raises:
             MachineError: if this machine cannot open the viewer.
@@ -63,6 +63,7 @@ class View:
 
     paused: bool
     speed: float
+    """Speed as a multiple of real time."""
     shown: int
     """Index of the shown environment."""
     num_envs: int
@@ -71,7 +72,7 @@ class View:
     reward: float
     """Reward of the last step in the shown environment."""
     conditions: Sequence[str]
-    """Conditions of success of the shown environment, with their values and bounds."""
+    """Text for each success condition of the shown environment, with its value and bound."""
     episode_return: float
     """Sum of the rewards of the shown episode so far."""
     episodes: int
@@ -79,20 +80,21 @@ class View:
     succeeded: int
     """Number of episodes of the shown environment that have ended with success."""
     last_episode: str
-    """How the last episode of the shown environment ended: return, length and causes."""
+    """Text about the last episode of the shown environment: return, length and causes of its end; empty without one."""
     curves: RewardCurves
     checkpoint: int | None
-    """Step of the policy's checkpoint; None: the policy has no checkpoint."""
+    """Checkpoint of the policy, by its number of environment steps; None: the policy has no checkpoint."""
     checkpoints: tuple[int, ...]
-    """Steps of the run's checkpoints."""
+    """Number of environment steps of each of the run's checkpoints, ascending."""
     follow: bool
-    """Whether each new checkpoint is played as soon as it appears."""
+    """Whether the playback switches to each new checkpoint when it appears."""
     knobs: tuple[Knob, ...]
-    """Components of the task's commands that the user can set, such as the velocity `vx`, each with its range."""
+    """Elements of the task's commands that the user can set, such as the velocity `vx`, each with its range."""
     commands: tuple[float, ...]
     """Present value of each item of `knobs` in the shown environment."""
     held: Mapping[str, float]
-    """Commands that the user holds at a value: name of the item of `knobs` -> value."""
+    """Name of each item of `knobs` that the user holds at a value -> value."""
     knob: int
     """Index of the item of `knobs` that the keys change."""
     message: str
+    """Last message for the user; empty if there is none."""

@@ -1,7 +1,4 @@
-"""Functions that write a video of one episode.
-
-The episode is played by a policy, read from a recording, or read from a failure case of a training.
-"""
+"""Functions that write a video of an episode: of a policy, of a recording, or of a failure case of a training."""
 
 import contextlib
 from collections.abc import Callable, Iterable, Iterator
@@ -31,12 +28,18 @@ def open_video(
 
     Args:
         model: model of the environments.
-        task: the task, with its camera, image size and `render_interval`.
-        file: an .mp4 or .gif.
-        env_grid: further environments to draw in the image; None: only one environment.
+        task: the task's configuration, with camera, image size and `render_interval`.
+        file: path of the video, an .mp4 or .gif.
+        env_grid: environments to draw together in each image; None: only one environment.
 
     Returns:
-        A renderer of images, the writer that takes them, and the number of environment steps between two frames.
+        A renderer of images, the writer to which the images are added, and the number of environment steps between two
+        frames.
+
+    Raises:
+        UsageError: for a file with another suffix.
+        DependencyError: if imageio is not installed.
+        MachineError: if this machine cannot render, or the file cannot be written.
     """
     stride = max(1, task.sim.render_interval // task.decimation)
     with Renderer(model, task.viewer, env_grid) as renderer, VideoWriter(file, stride * task.step_dt) as writer:
@@ -51,7 +54,7 @@ def record_episode(
     Args:
         env: the environments.
         act: the policy: observations (num_envs, d) -> actions (num_envs, a).
-        file: an .mp4 or .gif. It gets its name when it is complete.
+        file: path of the video, an .mp4 or .gif; until the video is complete, the file has another name.
         longest_s: longest simulated time of the video [s]; None: ten times the time limit of the task.
 
     Returns:
@@ -80,17 +83,20 @@ def record_episode(
 def film_replay(
     recording: Trajectory, env: VecEnv, episodes: Iterable[int], filmed: int, file: Path
 ) -> tuple[Replay, int]:
-    """Replay episodes of a recording, compare them with it, and film one of them.
+    """Replay episodes of a recording, compare them with the recording, and film one of them.
 
     Args:
         recording: the recording.
-        env: an environment with the recorded configuration.
+        env: environments with the recorded configuration.
         episodes: indices of the episodes to replay.
         filmed: index of the episode to film.
-        file: the video, an .mp4 or .gif.
+        file: path of the video, an .mp4 or .gif.
 
     Returns:
         The result of the comparison, and the number of frames.
+
+    Raises:
+        UsageError, DependencyError, MachineError: see `open_video`.
     """
     episode = recording.header.episodes[filmed]
     with open_video(env.engine.model, env.config, file) as (renderer, writer, stride):
@@ -105,7 +111,18 @@ def film_replay(
 
 
 def film_case(case: StagedCase, file: Path) -> tuple[int, float, str]:
-    """Film the recorded last steps of a failed episode; return frames, frames per second and the OpenGL backend."""
+    """Film the recorded last steps of a failed episode.
+
+    Args:
+        case: the failure case.
+        file: path of the video, an .mp4 or .gif.
+
+    Returns:
+        Number of frames, frames per second, and the OpenGL backend.
+
+    Raises:
+        UsageError, DependencyError, MachineError: see `open_video`.
+    """
     count = len(case.states)
     with open_video(case.staged.model, case.staged.resolved.task, file) as (renderer, writer, stride):
         # with this first index, the last state is among the filmed ones

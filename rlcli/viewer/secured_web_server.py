@@ -1,8 +1,8 @@
-"""Access control for MuJoCo's web viewer: it serves only its own page, only on this machine, and prints nothing.
+"""Access control for MuJoCo's web viewer: the server answers only its own page, only on this machine, prints nothing.
 
-MuJoCo's web viewer (`mujoco.studio`, private and new in 4.0) listens on every interface, answers requests of any page
-and loads models from them. The files of that package stay unchanged: while a viewer runs, this module replaces the few
-functions that open sockets and answer requests. `verify_refusals` then sends requests that the server must refuse.
+Without this module, MuJoCo's web viewer (`mujoco.studio`, private and new in 4.0) listens on every interface, answers
+requests of any page, and loads models that a page sends. While a viewer runs, this module replaces the few functions of
+that package that open sockets and answer requests. `verify_refusals` then sends requests that the server must refuse.
 """
 
 import contextlib
@@ -41,19 +41,20 @@ _REQUIRED_NAMES = {
     "app.inputs": ("handle_mouse_events", "handle_vis_options_keyboard_events", "handle_camera_select_keyboard_events"),
     "dear_imgui.dear_imgui": ("Begin", "Button", "Combo", "SliderFloat", "IsKeyChordPressed"),
 }
-"""Module of `mujoco.studio` -> the names that are used from it."""
+"""Module of `mujoco.studio` -> names of the module that rlcli uses."""
 _MAX_MESSAGE_BYTES = 2**20
+"""Largest message that the server accepts from a browser [bytes]."""
 _UNSUPPORTED_DATA = 1003
-"""Status code with which a WebSocket is closed (RFC 6455) because its type of data is not accepted."""
+"""Status code (RFC 6455) with which a WebSocket is closed if the type of its data is not accepted."""
 _REQUEST_S = 10.0
 """Time after which the server closes a connection without a complete request [s]."""
 
 
 def import_web_viewer() -> SimpleNamespace:
-    """Import MuJoCo's web viewer; return its modules by the last part of their names.
+    """Import MuJoCo's web viewer; return its modules as attributes, named by the last parts of the modules' names.
 
     Raises:
-        DependencyError: if the installed MuJoCo has another viewer or none.
+        DependencyError: if the installed MuJoCo has no web viewer, or a version of it that is not supported.
     """
     modules, missing = {}, []
     for name, attributes in _REQUIRED_NAMES.items():
@@ -68,20 +69,24 @@ def import_web_viewer() -> SimpleNamespace:
         absent = expected - set(inspect.signature(modules["web_viewer"].WebViewer).parameters)
         missing += [f"web_viewer.WebViewer({name})" for name in sorted(absent)]
     if missing:
-        raise incompatible_viewer(f"it lacks {', '.join(missing[:5])}")
+        raise incompatible_viewer(f"mujoco.studio has no {', '.join(missing[:5])}")
     return SimpleNamespace(**modules)
 
 
 def incompatible_viewer(why: str) -> DependencyError:
-    """Return the error for an installed MuJoCo whose web viewer is not supported; `why` is what differs."""
+    """Return the error for an installed MuJoCo whose web viewer is not supported; `why` is the reason."""
     return DependencyError(
-        f"the browser's viewer does not work with the installed mujoco {mujoco.__version__}: {' '.join(why.split())}",
+        f"the web viewer does not work with the installed mujoco {mujoco.__version__}: {' '.join(why.split())}",
         hint=f"{pip_install('mujoco==4.0.*')}, or use --video FILE.mp4, or --viewer none",
     )
 
 
 def listen(port: int, socket_class: type[socket.socket] = socket.socket) -> socket.socket:
-    """Return a listening socket on the loopback interface; port 0: any free port.
+    """Return a listening socket on the loopback interface.
+
+    Args:
+        port: the port; 0: any free port.
+        socket_class: class of the socket.
 
     Raises:
         MachineError: if the port is in use, or not allowed.
@@ -102,7 +107,7 @@ def listen(port: int, socket_class: type[socket.socket] = socket.socket) -> sock
 
 @contextlib.contextmanager
 def secured_server(studio: SimpleNamespace, listener: socket.socket) -> Iterator[None]:
-    """Replace functions of MuJoCo's web viewer in a `with` block.
+    """Replace functions of MuJoCo's web viewer during a `with` block.
 
     A viewer that starts in the block listens on `listener`, refuses requests of other pages, and prints nothing.
 
@@ -126,10 +131,10 @@ def secured_server(studio: SimpleNamespace, listener: socket.socket) -> Iterator
 
 
 def verify_refusals(port: int) -> None:
-    """Check the running server: it must answer a request for its page, and refuse requests of other pages.
+    """Check that the running server answers a request for its page, and refuses requests of other pages.
 
     Raises:
-        DependencyError: if the server answers with another status than expected.
+        DependencyError: if the server does not answer, or with another status than expected.
     """
     own = f"127.0.0.1:{port}"
     requests = {
@@ -144,6 +149,7 @@ def verify_refusals(port: int) -> None:
 
 
 def _status(port: int, headers: dict[str, str]) -> int:
+    """Return the HTTP status of the server's answer to a GET request with these headers."""
     with contextlib.closing(http.client.HTTPConnection("127.0.0.1", port, timeout=30)) as connection:
         try:
             connection.request("GET", "/", headers=headers)
@@ -163,20 +169,21 @@ def _serve_with_checks(server: Any, port: int) -> Any:
         handler: Any, *arguments: Any, process_request: Any, process_response: Any, **settings: Any
     ) -> Any:
         async def handle(connection: Any) -> None:
-            """Close the connection of a client whose messages the viewer cannot handle, and print nothing."""
+            """Handle a connection; close it, without a printed error, if the viewer cannot handle a message."""
             try:
                 await handler(connection)
             except Exception as error:
-                _log.debug("the browser's viewer closes a connection: %s", one_line(error, 200))
+                _log.debug("the web viewer closes a connection: %s", one_line(error, 200))
                 await connection.close(_UNSUPPORTED_DATA, "unexpected message")
 
         def check(connection: Any, request: Any) -> Any:
+            """Return the response 403 for a forbidden request; let the viewer answer other requests."""
             headers: dict[str, list[str]] = {}
             for name, value in request.headers.raw_items():
                 headers.setdefault(name.lower(), []).append(value)
             reason = refusal_reason(port, request.path, headers)
             if getattr(request, "method", "GET") != "GET":
-                reason = "only GET is answered"
+                reason = "the viewer answers only GET requests"
             if reason is not None:
                 body = f"refused: {reason}\n".encode()
                 refusal = server.Headers({"Content-Type": "text/plain", "Content-Length": str(len(body))})
@@ -184,7 +191,7 @@ def _serve_with_checks(server: Any, port: int) -> Any:
             return process_request(connection, request)
 
         def respond(connection: Any, request: Any, response: Any) -> Any:
-            """Replace the headers of a response, also of a refusal, so that no other page can read it."""
+            """Set the headers of a response, also of a refusal, so that no other page can read the response."""
             response = process_response(connection, request, response) or response
             for name in ("Access-Control-Allow-Origin", *own_headers):
                 if name in response.headers:
@@ -201,12 +208,16 @@ def _serve_with_checks(server: Any, port: int) -> Any:
 class _OwnProcessListener(socket.socket):
     """Socket that accepts only connections of this process.
 
-    MuJoCo's headless GUI, in this process, sends its drawing to the viewer over the loopback interface, which every
-    local user can reach.
+    MuJoCo draws the controls of the page in this process, and sends them to its server over the loopback interface,
+    to which every local user can connect.
     """
 
     def accept(self) -> tuple[socket.socket, Any]:
-        """Accept a connection; close it if another process has opened it."""
+        """Accept a connection; return the socket and the address of the peer.
+
+        Raises:
+            ConnectionAbortedError: if another process has opened the connection, which is then closed.
+        """
         connection, peer = super().accept()
         if _is_own_socket(peer):
             return connection, peer
@@ -215,7 +226,7 @@ class _OwnProcessListener(socket.socket):
 
 
 def _is_own_socket(peer: object) -> bool:
-    """Return whether this process has opened the socket at an address; True if the system has no list of sockets."""
+    """Return whether this process has a socket with the address `peer`; True if the system has no `/dev/fd`."""
     try:
         numbers = [int(name) for name in os.listdir("/dev/fd")]
     except OSError:
@@ -231,7 +242,7 @@ def _is_own_socket(peer: object) -> bool:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Send the warnings of MuJoCo's web viewer to stderr in a `with` block, and discard its other messages.
+    """Send the warnings of MuJoCo's web viewer to stderr during a `with` block, and discard its other messages.
 
     Errors of connections that a browser closes are discarded, too.
     """
@@ -255,5 +266,6 @@ def _quiet() -> Iterator[None]:
 
 
 def _is_unexpected(record: logging.LogRecord) -> bool:
+    """Return whether a log record is not about a connection that a browser has closed."""
     error = record.exc_info[1] if record.exc_info else None
     return type(error).__module__.partition(".")[0] != "websockets" and not isinstance(error, ConnectionError)

@@ -1,6 +1,6 @@
-"""Recorder of videos during a training (`--video-every`): one episode of the current policy.
+"""Recorder of videos during a training (`--video-every`): each video is an episode of the current policy.
 
-The episode runs in a separate environment, so that the training does not change.
+The episode runs in a separate environment, so that videos have no effect on the training.
 """
 
 import logging
@@ -18,19 +18,20 @@ _log = logging.getLogger(__name__)
 
 
 class VideoAborted(Exception):
-    """Exception that ends the recording of a video because training is being stopped."""
+    """Exception that ends the recording of a video because a signal has asked the training to stop."""
 
 
 class TrainingVideos(StepObserver):
-    """Recorder of videos of the deterministic policy, always in the same episode. It does not change the training.
+    """Recorder of videos of the deterministic policy, without effect on the training.
 
-    The environment is kept between videos; the OpenGL context is freed after each video.
+    Every video begins with the same initial state and seed. The environment is kept between videos; the OpenGL context
+    is freed after each video.
 
     Args:
-        make_env: builds a single environment, before the first video.
-        folder: folder of the videos `STEP.mp4`.
-        interval: iterations between videos.
-        stopping: returns whether a stop of the training was requested.
+        make_env: builds a single environment; called before the first video.
+        folder: folder of the videos, which are named `STEP.mp4` after the number of environment steps.
+        interval: number of iterations between videos.
+        stopping: returns whether a signal has asked the training to stop.
     """
 
     def __init__(
@@ -42,15 +43,17 @@ class TrainingVideos(StepObserver):
         self._warned: set[str] = set()
 
     def due(self, iteration: int) -> bool:
-        """Return whether the policy is filmed after this iteration."""
+        """Return whether the policy is filmed after an iteration, which is counted from 1."""
         return iteration % self._interval == 0
 
     def record(self, policy: Callable[[], Policy], step: int) -> Path | None:
-        """Film an episode and return the video's file; None if that failed, which is logged, or training is stopping.
+        """Film an episode and return the video's file.
+
+        None: the training is stopping, or an error occurred, of which the log warns once for each type of error.
 
         Args:
-            policy: returns a copy of the policy, so that filming does not change the trained one.
-            step: environment steps so far, which name the file.
+            policy: returns a copy of the policy.
+            step: number of environment steps of the training so far, for the name of the file.
         """
         file = self._folder / f"{step:012d}.mp4"
         try:
@@ -73,6 +76,10 @@ class TrainingVideos(StepObserver):
         return file
 
     def before_step(self) -> None:
-        """Raise `VideoAborted` if training is being stopped."""
+        """End the recording if the training is being stopped; called before each step of the filmed environment.
+
+        Raises:
+            VideoAborted: if a signal has asked the training to stop.
+        """
         if self._stopping():
             raise VideoAborted

@@ -1,4 +1,4 @@
-"""Writer of video files (.mp4, .gif), and checks that they can be written.
+"""Writer of video files (.mp4, .gif), and a check that this machine can write a video.
 
 Importing the module is fast, so that commands can refuse a wrong file name at once.
 """
@@ -22,50 +22,57 @@ FORMATS = (".mp4", ".gif")
 
 
 def check_video(file: Path) -> None:
-    """Check that a video can be written, before anything is simulated.
+    """Check that a video can be written to a file, before anything is simulated.
 
     Raises:
         UsageError: for a file that is neither .mp4 nor .gif.
-        DependencyError: if imageio is not installed.
+        DependencyError: if imageio, or imageio-ffmpeg for an .mp4, is not installed.
         MachineError: if there is no ffmpeg for an .mp4.
     """
     if file.suffix not in FORMATS:
         raise UsageError(f"'{file}' is not a video file", hint=f"give FILE{' or FILE'.join(FORMATS)}")
     needed = ["imageio"] if file.suffix == ".gif" else ["imageio", "imageio_ffmpeg"]
     if any(importlib.util.find_spec(name) is None for name in needed):
-        raise DependencyError("imageio is not installed", hint=pip_install("rlcli[video]"))
+        message = f"a video in {file.suffix} needs {' and '.join(needed)}"
+        raise DependencyError(message, hint=pip_install("rlcli[video]"))
     if file.suffix == ".mp4":
         _require_ffmpeg()
 
 
 def _require_ffmpeg() -> None:
-    """Check that there is an ffmpeg; imageio-ffmpeg contains one on platforms for which it has a wheel."""
+    """Check that the program ffmpeg is available; on most platforms, imageio-ffmpeg contains the program.
+
+    Raises:
+        MachineError: if there is no ffmpeg.
+    """
     import imageio_ffmpeg
 
     try:
         program = imageio_ffmpeg.get_ffmpeg_exe()
     except RuntimeError:
-        problem = "there is no ffmpeg, which writes .mp4"
+        problem = "an .mp4 needs the program ffmpeg, which was not found"
     else:
         if shutil.which(program):
             return
         problem = f"IMAGEIO_FFMPEG_EXE is not a program: {program}"
-    raise MachineError(problem, hint="install ffmpeg (Debian, Ubuntu: apt install ffmpeg); a .gif needs none")
+    raise MachineError(problem, hint="install ffmpeg (Debian, Ubuntu: apt install ffmpeg), or write a .gif")
 
 
 class VideoWriter(contextlib.AbstractContextManager["VideoWriter"]):
-    """Writer of frames to an .mp4 or .gif; the file gets its name only when it is complete.
+    """Writer of images to an .mp4 or .gif, used in a `with` block; the file gets its name only at the end of the block.
 
-    A frame of a GIF lasts a whole number of hundredths of a second, and players slow down frames shorter than two. So a
-    GIF of faster frames gets only every second, third, ... frame: the smallest stride whose speed is right within 2 %.
+    If the block raises an error or adds no image, no file is written. A frame of a GIF lasts a whole number of
+    hundredths of a second, and players show frames shorter than 0.02 s too slowly. So a GIF of shorter frames has only
+    every n-th image: the smallest n whose speed is right within 2 %.
 
     Args:
-        file: the video.
+        file: path of the video.
         period: time between two images [s].
 
     Raises:
         UsageError: for a file with another suffix.
         DependencyError: if imageio is not installed.
+        MachineError: if there is no ffmpeg for an .mp4, or the file cannot be written.
     """
 
     def __init__(self, file: Path, period: float) -> None:
@@ -100,7 +107,11 @@ class VideoWriter(contextlib.AbstractContextManager["VideoWriter"]):
             self._temporary.unlink(missing_ok=True)
 
     def add(self, image: NDArray[np.uint8]) -> None:
-        """Append an image to the video. (height, width, 3)"""
+        """Append an RGB image to the video. (height, width, 3)
+
+        Raises:
+            MachineError: if the file cannot be written.
+        """
         self._added += 1
         if (self._added - 1) % self._stride:
             return
@@ -112,7 +123,9 @@ class VideoWriter(contextlib.AbstractContextManager["VideoWriter"]):
 
 
 def gif_stride(period: float) -> int:
-    """Return the number n such that a GIF that contains every n-th image plays at the right speed (see `VideoWriter`).
+    """Return the smallest n such that a GIF of every n-th image plays at the right speed within 2 %.
+
+    The result is 1 if there is no such number below 64; see `VideoWriter` for the reason.
 
     Args:
         period: time between two images [s].

@@ -1,7 +1,4 @@
-"""Viewer in the browser, which uses MuJoCo's own web viewer with access control.
-
-`rlcli play --viewer web` opens it.
-"""
+"""Viewer in the browser (`rlcli play --viewer web`): MuJoCo's web viewer, with access control."""
 
 import contextlib
 import copy
@@ -35,10 +32,10 @@ _VISIBLE_FIELDS = (
 
 
 def run(playback: Playback, *, title: str, num_drawn: int = 1, port: int, ready: Ready) -> None:
-    """Play until the user chooses Quit in the page, or an exception such as Ctrl-C; see `rlcli.viewer.protocol.Viewer`.
+    """Play in real time until the user chooses Quit in the page; see `rlcli.viewer.protocol.Viewer`.
 
     Raises:
-        DependencyError: if the installed MuJoCo has another web viewer or none.
+        DependencyError: if the installed MuJoCo has no web viewer, or a version of it that is not supported.
         MachineError: if the port is in use.
     """
     studio = import_web_viewer()
@@ -51,7 +48,7 @@ def run(playback: Playback, *, title: str, num_drawn: int = 1, port: int, ready:
             instructions = [f"open http://127.0.0.1:{port}/ in a browser on this machine; Ctrl-C ends the viewer"]
             tunnel = ssh_tunnel_command(port)
             if tunnel is not None:
-                there = f"run {tunnel} there, then open http://localhost:{port}/"
+                there = f"run {tunnel}, then open http://localhost:{port}/ there"
                 instructions.append(f"on the machine from which you connect by SSH: {there}")
             ready(instructions, f"http://127.0.0.1:{port}/")
             run_in_real_time(playback, viewer.is_open, viewer.send)
@@ -61,7 +58,7 @@ def run(playback: Playback, *, title: str, num_drawn: int = 1, port: int, ready:
 
 
 def ssh_tunnel_command(port: int) -> str | None:
-    """Return the `ssh -L` command that forwards a port to the user's machine; None if this is not an SSH session."""
+    """Return the `ssh -L` command that forwards a port to the user's machine; None outside an SSH session."""
     connection = os.environ.get("SSH_CONNECTION", "").split()
     if len(connection) != 4:
         return None
@@ -73,7 +70,14 @@ def ssh_tunnel_command(port: int) -> str | None:
 
 
 class _ViewerThread:
-    """Thread that runs MuJoCo's web viewer; `send` gives it the state to show."""
+    """Thread that runs MuJoCo's web viewer; `send` gives the thread the state to show.
+
+    Args:
+        studio: the viewer's modules, from `import_web_viewer`.
+        playback: environments and policy.
+        title: task and run, for the user.
+        num_drawn: number of environments in the image.
+    """
 
     def __init__(self, studio: Any, playback: Playback, title: str, num_drawn: int) -> None:
         from rlcli.viewer.web_panel import WebPanel
@@ -100,16 +104,16 @@ class _ViewerThread:
             self._error = error
 
     def is_open(self) -> bool:
-        """Return whether the viewer still runs; also empty its event queues, which would grow otherwise."""
+        """Return whether the viewer still runs; also empty its event queues, which would otherwise grow."""
         self._endpoint.get_viewer_events()
         self._endpoint.get_viewer_snapshots()
         return self._thread.is_alive()
 
     def raise_error(self) -> None:
-        """Raise the error that has ended the viewer's thread, if there is one that is no `RlcliError`.
+        """Check that no error has ended the viewer's thread, except for an `RlcliError`.
 
         Raises:
-            DependencyError: if the viewer has raised an error.
+            DependencyError: if MuJoCo's viewer has raised an error.
         """
         if self._error is not None and not isinstance(self._error, RlcliError):
             raise incompatible_viewer(f"{type(self._error).__name__}: {self._error}") from self._error

@@ -1,7 +1,7 @@
-"""Panel of the browser's viewer: controls beside the scene (buttons, sliders, plots), and keyboard shortcuts.
+"""Panel of the web viewer: controls beside the scene (buttons, sliders, plots), and keyboard shortcuts.
 
-The panel runs in the viewer's thread. It reads the playback's view and submits requests; it changes nothing else. The
-force on a dragged body is applied in the simulation; other edits in the page have no effect on it.
+The panel runs in the viewer's thread; it reads `Playback.view` and submits requests. If the user drags a body, the
+force is applied in the simulation; other edits in the page do not change the simulation.
 """
 
 from collections.abc import Callable, Sequence
@@ -34,18 +34,18 @@ Method = TypeVar("Method", bound=Callable[..., None])
 
 
 def _handler(priority: int) -> Callable[[Method], Method]:
-    """Return MuJoCo's decorator `messages.handler`, typed; it makes a method handle the events of the page."""
+    """Return MuJoCo's decorator `messages.handler`, with types; a decorated method handles events of the page."""
     return cast("Callable[[Method], Method]", messages.handler(priority=priority))
 
 
 class WebPanel(plugin.ViewerPlugin):  # type: ignore[misc]  # MuJoCo has no types
-    """Panel and keys of the browser's viewer.
+    """Panel and keys of the web viewer.
 
     Args:
         playback: the playback that is shown and controlled.
         title: the task and the run.
-        camera: initial camera.
-        env_origins: origin of each environment in its world. (num_envs, 3) [m]
+        camera: initial camera, relative to the shown environment.
+        env_origins: origin of each environment, world frame. (num_envs, 3) [m]
     """
 
     def __init__(self, playback: Playback, title: str, camera: mujoco.MjvCamera, env_origins: np.ndarray) -> None:
@@ -130,7 +130,7 @@ class WebPanel(plugin.ViewerPlugin):  # type: ignore[misc]  # MuJoCo has no type
         ux.view_gizmo_gui(self.viewer.model, self.viewer.data, self.viewer.camera, self._ux, area)
 
     def _begin(self) -> None:
-        """Begin the panel: docked to the left, or on a narrow page below the middle of the scene."""
+        """Begin the panel: docked to the left, or on a narrow page in its lower part."""
         page = imgui.GetIO().DisplaySize
         if page.x < _NARROW:
             imgui.SetNextWindowPos(imgui.Vec2(0.0, 0.55 * page.y))
@@ -153,7 +153,7 @@ class WebPanel(plugin.ViewerPlugin):  # type: ignore[misc]  # MuJoCo has no type
                 if imgui.Selectable(name, step == view.checkpoint):
                     playback.submit(partial(playback.switch, step))
             imgui.EndCombo()
-        changed, follow = imgui.Checkbox("Play new ones as they appear", view.follow)
+        changed, follow = imgui.Checkbox("Play new checkpoints as they appear", view.follow)
         if changed:
             playback.submit(partial(playback.set_follow, follow))
 
@@ -162,7 +162,7 @@ class WebPanel(plugin.ViewerPlugin):  # type: ignore[misc]  # MuJoCo has no type
             imgui.SeparatorText("Commands")
         for knob, command in zip(view.knobs, view.commands, strict=True):
             changed, hold = imgui.Checkbox(f"hold##{knob.name}", knob.name in view.held)
-            imgui.SetItemTooltip("Checked: keep this value. Unchecked: the task samples it.")
+            imgui.SetItemTooltip("Checked: keep this value. Unchecked: the task samples the value.")
             imgui.SameLine()
             imgui.SetNextItemWidth(imgui.GetContentRegionAvail().x * 0.5)
             moved, value = imgui.SliderFloat(knob.label, command, knob.low, knob.high)
@@ -189,7 +189,7 @@ class WebPanel(plugin.ViewerPlugin):  # type: ignore[misc]  # MuJoCo has no type
             imgui.TextWrapped(f"{view.succeeded} of {view.episodes} episodes succeeded")
 
     def _reward_plot(self, view: View) -> None:
-        """Plot the reward and its terms over the last seconds; the legend has the newest values."""
+        """Plot the reward and its terms over the last seconds; the legend shows the newest values."""
         imgui.SeparatorText("Reward per step")
         size = imgui.Vec2(-1.0, 150.0 + 19.0 * len(view.curves.values))
         flags = int(implot.Flags.NoTitle) | int(implot.Flags.NoMenus) | int(implot.Flags.NoMouseText)
@@ -224,14 +224,16 @@ class WebPanel(plugin.ViewerPlugin):  # type: ignore[misc]  # MuJoCo has no type
         self._ux.camera_index = ux.TUMBLE_CAMERA_IDX
 
     def _followed_point(self, shown: int) -> np.ndarray:
-        """Return the point that the camera follows: the environment's origin or `viewer.follow`. (3,) [m]"""
+        """Return the point that the camera follows: the environment's origin, or how far `viewer.follow` has moved from
+        its default position. (3,) [m]
+        """
         if self._followed is None:
             return np.asarray(self._env_origins[shown])
         body, start = self._followed
         return np.asarray(self.viewer.data.xpos[body] - start)
 
     def _push(self) -> None:
-        """Apply the force on a dragged body in the simulation, until the user releases it."""
+        """Apply the force on a dragged body in the simulation, until the user releases the body."""
         model, data, perturb = self.viewer.model, self.viewer.data, self.viewer.perturb
         if not perturb.active and not self._pushing:
             return

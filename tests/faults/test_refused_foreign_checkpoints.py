@@ -303,7 +303,7 @@ def test_repeated_tensor_does_not_fill_the_memory(monkeypatch):
         (
             {"actor.0.weight": torch.zeros(8, 4), "actor.0.bias": torch.zeros(8), "actor.2.weight": torch.zeros(1, 9),
              "actor.2.bias": torch.zeros(1), "std": torch.ones(1)},
-            "a layer with 8 outputs is followed by one with 9 inputs",
+            "a layer with 8 outputs is followed by a layer with 9 inputs",
         ),
         (
             {"actor.0.weight": torch.zeros(1, 6), "actor.0.bias": torch.zeros(1), "std": torch.ones(1),

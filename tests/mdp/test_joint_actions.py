@@ -377,6 +377,6 @@ def test_invalid_actuator_model_is_rejected(tmp_path, model, message):
 
 
 def test_joint_of_two_models_is_rejected(tmp_path):
-    with pytest.raises(ConfigError, match="joint 'elbow' belongs to 'one' already; remove one"):
+    with pytest.raises(ConfigError, match="joint 'elbow' belongs to 'one' already; remove it from one"):
         arm(tmp_path, {"func": "joint_effort", "joints": ["elbow"]},
             actuators={"one": {"joints": ["elbow"]}, "two": {"joints": ["e.*"]}})  # fmt: skip

@@ -166,7 +166,7 @@ def test_invalid_record_options_are_refused_before_the_run(cli, coin):
 
 def test_unknown_episode_is_refused_with_the_count(cli, coin):
     cli("eval", coin, "--policy", "random", "--episodes", 4, "--record", "r.safetensors")
-    assert "it has 4 episodes" in expect_code(cli("replay", "r.safetensors", "--episode", 4), 2).err
+    assert "the file has 4 episodes" in expect_code(cli("replay", "r.safetensors", "--episode", 4), 2).err
 
 
 @pytest.mark.slow

@@ -99,7 +99,7 @@ def test_disk_error_names_the_first_missing_folder(tmp_path):
         tmp_path / "run" / "checkpoints" / "x", FileNotFoundError(errno.ENOENT, "No such file")
     )
     assert error.message.endswith(f"x: No such file (there is no folder {tmp_path / 'run'})")
-    assert error.hint == "create the folder; if it was moved or deleted meanwhile, put it back"
+    assert error.hint == "create the folder; if the folder was moved or deleted meanwhile, put it back"
 
 
 def test_disk_error_without_errno_keeps_its_message(tmp_path):

@@ -181,7 +181,7 @@ SHAPE = f"{HEADER}.shape"
         (edit_manifest(lambda m: m.pop("step")), MANIFEST + "missing key 'step'"),
         (edit_manifest(lambda m: m.update(step=-1)), MANIFEST + "step: expected a whole number >= 0, found -1"),
         (edit_manifest(lambda m: m.update(step=2**62)), MANIFEST + "step: expected a whole number < "),
-        (edit_manifest(lambda m: m.update(step=200)), "it has step 200, its folder is named 000000000300"),
+        (edit_manifest(lambda m: m.update(step=200)), "has step 200, but its folder is named 000000000300"),
         (edit_manifest(lambda m: m["files"].pop("rng.safetensors")), "has no rng.safetensors"),
         (edit_manifest(lambda m: m["files"].pop("state.json")), "has no state.json"),
         (edit_manifest(lambda m: m.update(logs=[])), MANIFEST + "logs: expected a mapping, found []"),
@@ -349,7 +349,7 @@ def test_steps_ignores_links(folder):
 )  # fmt: skip
 def test_numbers_of_a_policy_fit_single_precision(key, value):
     with pytest.raises(
-        CheckpointError, match=rf"policy\.json is not valid; export it again, or use another checkpoint: {key}"
+        CheckpointError, match=rf"policy\.json is not valid; export the policy again, or use another checkpoint: {key}"
     ):
         blank_policy({**SPEC, key: value})
 

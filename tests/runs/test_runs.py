@@ -223,7 +223,7 @@ def test_latest_names_the_refused_runs(tmp_path, caplog):
         os.mkfifo(run.config)
     assert find_run("latest", tmp_path, "cartpole")[0].folder == runs[0].folder
     assert "a run is skipped: " in caplog.text
-    assert "is not a regular file; move it out of the run; 1 more are skipped" in caplog.text
+    assert "is not a regular file; move it out of the run's folder; 1 more are skipped" in caplog.text
     (runs[0].folder / "tb").symlink_to(tmp_path)
     with pytest.raises(CheckpointError, match=r"no valid run of cartpole in .* 2 more are skipped"):
         find_run("latest", tmp_path, "cartpole")

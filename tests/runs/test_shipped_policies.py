@@ -135,7 +135,7 @@ def test_bundle_of_a_task_folder_needs_the_folder(cli, coin):
     cli("train", coin, "--max-iterations", 1, "--logger", "none", "-q")
     cli("export", coin, "--format", "bundle", "--output", "gift")
     done = cli("play", "--checkpoint", "gift", *NUMBERS)
-    assert (done.code, "name its folder" in done.err) == (5, True), done.err
+    assert (done.code, "name the folder of the task" in done.err) == (5, True), done.err
     assert cli("play", coin, "--checkpoint", "gift", *NUMBERS).code == 0
 
 

@@ -366,7 +366,7 @@ def test_process_with_open_cameras_exits_without_error(tmp_path, way, code, back
 def test_rendering_in_forked_process_raises_machine_error(tmp_path):
     done = program(tmp_path, "fork")
     assert done.returncode == 0, done.stderr
-    assert "MachineError cameras render only in the process that made the environment" in done.stdout
+    assert "MachineError cameras render only in the process that created the environment" in done.stdout
 
 
 @pytest.mark.slow

@@ -432,7 +432,7 @@ def test_state_dict_restores_contact_times_and_history(tmp_path):
         (rays(pattern={"size": [1, 1], "resolution": 0}), "pattern.resolution: expected a number > 0", None),
         (rays(pattern=[[0, 0, 0]]), "feet.pattern.0: a direction must not be zero", None),
         (rays(pattern=[]), "feet.pattern: ", None),
-        (rays(pattern=[[0, 0, -1]], body="leg_.*"), "feet.body: 'leg_.*' matches several bodies", "name one of them"),
+        (rays(pattern=[[0, 0, -1]], body="leg_.*"), "feet.body: 'leg_.*' matches several bodies", "name one body"),
         (rays(pattern=[[0, 0, -1]], body="head"), "feet.body: no body matches 'head'", "torso"),
         (rays(pattern=[[0, 0, -1]], sees=[6]), "feet.sees", None),
         (rays(pattern=[[0, 1, -1]], lookup=True, alignment="yaw"), "feet: lookup needs rays straight down", None),

@@ -348,7 +348,7 @@ def test_raising_check_is_finding_and_others_run(direct):
     found = errors(direct)
     assert "KeyError: 'partial'" in found["finite"].message
     assert "task.py:" in found["finite"].where
-    assert found["partial-reset"].hint == "first correct what the check finite reports: it is the same error"
+    assert found["partial-reset"].hint == "first correct what the check finite reports: the error is the same"
     assert "start-states" in found
 
 

@@ -15,6 +15,6 @@ def test_spent_budget_is_refused(option, tmp_path, monkeypatch, capsys):
     run = Path(capsys.readouterr().out.split()[-1])
     config = (run / "config.yaml").read_text()
     assert main(["train", "--resume", str(run), *option, "-q"]) == 2
-    assert f"{option[0]} counts from its start" in capsys.readouterr().err
+    assert f"{option[0]} counts from the run's start" in capsys.readouterr().err
     assert (run / "config.yaml").read_text() == config
     assert main(["train", "--resume", str(run), "--max-iterations", "3", "-q"]) == 0

@@ -121,8 +121,8 @@ def test_python_state_of_task_is_resumed_exactly(task, kind, capsys):
 def test_run_warns_of_state_that_no_checkpoint_can_store(task, capsys):
     train(task("direct", "self.order = itertools.cycle([1, 2, 3])"), "--max-iterations", "1")
     assert (
-        "a resumed run may differ from an uninterrupted one: no checkpoint can store Task.order (cycle); keep the"
-        " state of the task in numbers, containers, tensors or generators" in capsys.readouterr().err
+        "a resumed run may differ from a run without interruption, because no checkpoint can store Task.order (cycle);"
+        " keep the state of the task in numbers, containers, tensors or random generators" in capsys.readouterr().err
     )
     (run,) = Path("runs").glob("*/*")
     assert not json.loads((run / "run.json").read_text())["resumes_exactly"]

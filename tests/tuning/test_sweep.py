@@ -106,7 +106,7 @@ def test_objective_reads_evaluation_document():
         ((*RATE, "--storage", "sqlite:///x.db?timeout=abc"), 2, "is not the URL of a database"),
         ((*RATE, "--storage", "sqlite:///%00"), 2, "is not the URL of a database"),
         ((*RATE, "--storage", "postgresql://a:b@host:abc/x"), 2, "is not the URL of a database"),
-        ((*RATE, "--storage", "oracle://x"), 7, "needs the driver"),
+        ((*RATE, "--storage", "oracle://x"), 7, "needs the database driver"),
         ((*RATE, "--objective", "return@1000", "--max-steps", "10"), 2, "limits the length"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Requests that the browser's viewer answers or refuses."""
+"""Requests that the web viewer answers or refuses."""
 
 import pytest
 
@@ -122,4 +122,4 @@ def test_content_security_policy_allows_only_own_server():
 def test_security_header_that_appears_twice_is_refused(name):
     values = {"host": "localhost:8080", "origin": "http://localhost:8080", "upgrade": "websocket"}
     headers = {**socket(), name: [values.get(name, "same-origin")] * 2}
-    assert refusal_reason(8080, "/state", headers) == f"the header {name} appears twice"
+    assert refusal_reason(8080, "/state", headers) == f"the request has the header {name} twice"

@@ -201,7 +201,7 @@ def test_missing_ffmpeg_error_says_how_to_install(monkeypatch, tmp_path):
         raise RuntimeError("No ffmpeg exe could be found.")
 
     monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", fails)
-    with pytest.raises(MachineError, match="there is no ffmpeg") as caught:
+    with pytest.raises(MachineError, match="needs the program ffmpeg, which was not found") as caught:
         check_video(tmp_path / "x.mp4")
     assert "apt install ffmpeg" in caught.value.hint
 

@@ -397,7 +397,7 @@ def test_run_of_a_package_is_played_with_the_folder_of_the_task(cli, coin):
     Path("coin").rename("my_coin")
     done = cli("eval", "--checkpoint", run)
     assert done.code == 4
-    assert "or name its folder: rlcli play FOLDER --checkpoint" in done.err
+    assert "or name the task's folder: rlcli play FOLDER --checkpoint" in done.err
     assert cli("eval", "./my_coin", "--checkpoint", run, "--episodes", 2).code == 0
     Path("my_coin").rename("other")
     done = cli("eval", "./other", "--checkpoint", run)

@@ -112,7 +112,8 @@ def test_unlocked_running_run_is_interrupted(cli, made, checkpoint, step, resuma
 def test_run_that_is_killed_at_once_is_interrupted_at_once(cli, made):
     made("a", [row(1)], "running", started=datetime.now(UTC).isoformat())
     (found,) = listed(cli)
-    assert (found["state"], found["reason"]) == ("interrupted", "its process was killed, or the machine stopped")
+    reason = "the process of the run was killed, or the machine stopped"
+    assert (found["state"], found["reason"]) == ("interrupted", reason)
 
 
 def test_run_that_ends_while_it_is_read_is_not_interrupted(made):

@@ -240,7 +240,7 @@ def test_mujoco_without_web_viewer_is_dependency_error(cli, monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco.studio.web_viewer", None)
     done = cli(*ZERO, "--viewer", "web", "--port", "0")
     assert done.code == 7
-    assert "the browser's viewer does not work with the installed mujoco" in done.err
+    assert "the web viewer does not work with the installed mujoco" in done.err
 
 
 def test_server_without_access_checks_is_stopped():

@@ -134,8 +134,8 @@ def _rows(ended):
     [
         ([False, False], "no episode has ended yet"),
         ([False, True], ""),
-        ([True, False], "no episode ended for 1 iteration, so the figures are older"),
-        ([True] + [False] * 15, "no episode ended for 15 iterations, so the figures are older"),
+        ([True, False], "no episode ended for 1 iteration, so the figures are of older episodes"),
+        ([True] + [False] * 15, "no episode ended for 15 iterations, so the figures are of older episodes"),
         ([True, False, False, True], ""),
     ],
 )
@@ -154,7 +154,7 @@ def test_line_of_a_training_says_how_old_its_figures_are(ended, note):
 
 def test_age_of_figures_beyond_the_known_rows_is_a_lower_bound():
     progress = progress_from_metrics(_rows([True, False, False, False])[2:], 40)
-    assert progress.no_episode == "no episode ended for at least 2 iterations, so the figures are older"
+    assert progress.no_episode == "no episode ended for at least 2 iterations, so the figures are of older episodes"
 
 
 def test_time_left_of_a_training_with_a_threshold_is_an_upper_bound():
