@@ -1,1 +1,1 @@
-"""The command line: one module for each command, `app` with main and exit codes, and `ui` for output and options."""
+"""The command line of rlcli: main function (`app`), one module for each command (`commands`), output (`ui`)."""

@@ -94,7 +94,7 @@ def _root(
 
 @functools.cache
 def build(only: str | None = None) -> typer.Typer:
-    """Return the typer app with all commands, or only with the command `only`, which is faster."""
+    """Return the typer app with all commands. With `only`, import just the module of this command: this is faster."""
     app = typer.Typer(
         cls=HelpGroup,
         context_settings=_SETTINGS,
@@ -118,7 +118,12 @@ def build(only: str | None = None) -> typer.Typer:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command line and return its exit code."""
+    """Run one command of rlcli and return its exit code.
+
+    Args:
+        arguments: the words after `rlcli`; None: those of this process (`sys.argv`). With None, the function also sets
+            signal handlers and import hooks, because the process then runs only this command.
+    """
     print_log_records()
     console.owns_process = arguments is None
     if console.owns_process:
@@ -186,7 +191,8 @@ def _require_words(arguments: list[str]) -> None:
     for position, word in enumerate(arguments):
         if not word or (word.startswith("--") and word.endswith("=")):
             name = word or (arguments[position - 1] if position else "rlcli")
-            raise UsageError(f"there is an empty word after {name.rstrip('=')}", hint="give a value, or leave it out")
+            message = f"there is an empty word after {name.rstrip('=')}"
+            raise UsageError(message, hint="write a value there, or leave out the empty word")
     words = dict.fromkeys(arguments, "a word of the command line") | {
         value: name for name, value in os.environ.items() if name.startswith("RLCLI_")
     }
@@ -251,7 +257,7 @@ def _as_rlcli_error(error: BaseException, arguments: list[str]) -> RlcliError:
 
     Args:
         error: any exception of a command, a task's code or a library.
-        arguments: the words of the command line, for the hint of a wrong option.
+        arguments: the words of the command line; the hint about an unknown option repeats its value.
     """
     # a corrupt checkpoint may claim any size: its error names the file, which helps more than "too little memory"
     if not isinstance(error, CheckpointError) and (too_little := memory_error(error)):
@@ -343,7 +349,7 @@ def _hint_for_option(name: str, arguments: list[str]) -> str | None:
 
 
 def _matching_settings(option: str) -> list[str]:
-    """Return the configuration keys that an unknown option may mean: keys that equal or end with its name.
+    """Return the configuration keys that an unknown option may mean: keys that equal the option's name or end with it.
 
     The list is empty if more than three keys end with the name.
     """
@@ -368,7 +374,7 @@ def _agent_models() -> set[type[BaseModel]]:
 _FOREIGN_OPTIONS = {
     "task": "the task is named without an option, as in `rlcli train cartpole`",
     "load-run": "--checkpoint RUN names a run or one of its checkpoints; `rlcli train --resume RUN` continues a run",
-    "enable-cameras": "leave out this option: cameras of a task need none",
+    "enable-cameras": "leave out this option: rlcli always renders the cameras that a task uses",
 }
 """Option that users know from other training programs -> hint that says what to write in rlcli instead."""
 _SHORT_FOR = {"lr": "learning_rate"}

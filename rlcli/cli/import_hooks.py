@@ -1,6 +1,6 @@
 """Import hooks that the command line installs: one checks the memory limit, one protects matplotlib's settings.
 
-Python calls them before it imports a module.
+Python calls the hooks before it imports a module.
 """
 
 import contextlib
@@ -20,7 +20,7 @@ class AddressSpaceCheck:
 
     @staticmethod
     def find_spec(name: str, *_: object) -> None:
-        """Check the limit if the module is numpy, mujoco or torch; return None, so that Python's own finder finds it.
+        """Check the limit if the module is numpy, mujoco or torch; return None, so that Python searches for the module.
 
         Raises:
             MachineError: if the limit is too low for this library.
@@ -38,7 +38,7 @@ class MatplotlibFinder:
 
     @staticmethod
     def find_spec(name: str, path: Sequence[str] | None = None, target: ModuleType | None = None) -> ModuleSpec | None:
-        """Return a module specification whose loader changes the current folder; None for modules but matplotlib."""
+        """Return the specification of matplotlib, whose loader changes the current folder; None for other modules."""
         spec = PathFinder.find_spec(name, path, target) if name == "matplotlib" else None
         if spec is None or spec.loader is None or spec.origin is None:
             return None

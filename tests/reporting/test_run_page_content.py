@@ -214,7 +214,7 @@ def test_page_without_matplotlib_names_pip_command(cli, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "code", "message"),
     [
-        (["latest", "-o", "x.pdf"], 2, "its name must end in .html"),
+        (["latest", "-o", "x.pdf"], 2, "the name must end in .html"),
         (["latest", "-o", "nowhere/x.html"], 10, "there is no folder"),
         (["nothing"], 5, "no run 'nothing'"),
         (["latest@best"], 5, "no complete checkpoint"),

@@ -51,7 +51,7 @@ def command(
     Options:
         case: Show this case, by its number in the list, from 0. [default: list all]
         sort: Order of the list: when (oldest first), return, length or kind (why it was recorded).
-        steps: Number of last steps of a case to show.
+        steps: Number of steps at the end of the case to show.
         video: Render the last seconds of the case to FILE.mp4 or FILE.gif. Without FILE: autopsy.mp4.
 
     Examples:
@@ -89,7 +89,15 @@ def command(
 
 
 def _refuse_bundle(folder: str, case: int | None) -> None:
-    """Print that an exported bundle has no recorded episodes; raise a UsageError if a case was chosen."""
+    """Print that an exported bundle has no recorded episodes.
+
+    Args:
+        folder: the folder of the bundle.
+        case: number of the recorded episode on the command line; None: the command has to list all.
+
+    Raises:
+        UsageError: if `case` is given.
+    """
     from rlcli.runs.policy_bundle import open_bundle
 
     open_bundle(Path(folder))
@@ -236,7 +244,7 @@ def _print_contacts(contacts: Sequence[Contact]) -> None:
 def sparkline(values: Sequence[float], width: int = _WIDTH) -> str:
     """Return values as a line of at most `width` bars of eight heights; `?` for a value that is not finite.
 
-    If there are more values, each bar is the mean of neighbours.
+    If there are more than `width` values, each bar shows the mean of several adjacent values.
     """
     if len(values) > width:
         edges = [round(i * len(values) / width) for i in range(width + 1)]

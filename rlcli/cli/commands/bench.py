@@ -135,7 +135,7 @@ def _report(
     for line in explanation(findings):
         console.data(line)
     if findings.unsteady:
-        console.warn("repeats differ by more than 15 %: end other programs on this machine and measure again")
+        console.warn("repeated measurements differ by more than 15 %: end other programs and measure again")
     changes = None if findings.recommended is None else bench.changes(findings.recommended.setting)
     if changes is not None and file is not None:
         write_atomic(file, bench_preset(resolved, changes, findings, machine, names_agent))
@@ -176,7 +176,7 @@ def _preset_file(name: str, overwrite: bool) -> Path:
     if os.path.lexists(file) and not overwrite:
         raise UsageError(f"--save-preset: {file} exists", hint="choose another name, or add --overwrite")
     if not folder.is_dir():
-        raise MachineError(f"--save-preset: there is no folder {folder}; create it, or choose another")
+        raise MachineError(f"--save-preset: there is no folder {folder}; create this folder, or choose another one")
     require_writable(file)
     return file
 
@@ -243,7 +243,7 @@ def _last_cells(row: Stepped | Trained, remark: str) -> list[str]:
 
 
 class _View(LiveView):
-    """View of the measurements so far: a growing block on a terminal, else lines."""
+    """Progress display of `rlcli bench`: a block that is redrawn on a terminal, else one line for each measurement."""
 
     def __init__(self, title: str) -> None:
         super().__init__(refresh_per_second=4, transient=True)
@@ -251,12 +251,12 @@ class _View(LiveView):
         self._rows: list[list[str]] = []
 
     def announce(self, current: str) -> None:
-        """Show the description of what is measured next."""
+        """Show a text that describes the measurement that starts now. Without a terminal, show nothing."""
         self._current = current
         self._draw()
 
     def show(self, findings: Findings) -> None:
-        """Show the measurements so far."""
+        """Show the finished measurements. Without a terminal, print only the last one, if it is new."""
         rows = [_step_parts(row) for row in findings.stepped]
         for row in findings.trained:
             setting, ms = row.setting, cell(row.milliseconds, ".4g", " ms")

@@ -1,6 +1,6 @@
 """Command `rlcli diff`: comparison of two runs or of two configurations.
 
-For runs it prints where they differ first, for configurations all differences.
+For two runs the command prints where they first differ, for two configurations all differences.
 """
 
 from __future__ import annotations
@@ -125,9 +125,9 @@ def _compare_configurations(one: Resolved | Run, other: Resolved | Run, left: Si
 
     Args:
         one: configuration of a task, or a run.
-        other: the one to compare with; at least one of the two is a task.
-        left: what was typed for `one`.
-        right: what was typed for `other`.
+        other: configuration or run to compare with `one`; `one` and `other` are not both runs.
+        left: the words of the command line that name `one`.
+        right: the words of the command line that name `other`.
 
     Returns:
         Whether the configurations are equal, except for cosmetic differences.

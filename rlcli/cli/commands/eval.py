@@ -84,7 +84,7 @@ def command(
 
 
 def _compare(request: PolicyRequest, episodes: int, limits: Sequence[Limit]) -> None:
-    """Run `rlcli eval --compare`, whose arguments are policies, not a task and overrides."""
+    """Run `rlcli eval --compare`: its arguments are the names of policies and overrides that apply to all of them."""
     from rlcli.cli.ui.evaluation_tables import show_comparison
     from rlcli.evaluation.comparison import compare, find_policies
     from rlcli.evaluation.limits import failures, require_success

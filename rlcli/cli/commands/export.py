@@ -1,4 +1,4 @@
-"""Command `rlcli export`: a trained policy as one file that runs on a robot without rlcli.
+"""Command `rlcli export`: conversion of a trained policy into one file that runs on a robot without rlcli.
 
 With --verify the file also controls the robot in plain MuJoCo, and the result is compared with an evaluation.
 """
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from rlcli.runs.run import Run
 
 _MAX_KEYS = 10
-"""Number of metadata keys that --verify prints at most, of those whose values differ from the task's."""
+"""Largest number of differing metadata keys that --verify prints (keys whose value differs from the task's value)."""
 
 
 def command(
@@ -180,7 +180,7 @@ def _export_bundle(saved: Checkpoint, run: Run | None, output: Path) -> None:
 
 
 def _find(reference: str | None, runs_dir: Path, task: str | None) -> Choice:
-    """Return the checkpoint or bundle to export, and the reason for the choice; its folder may be outside of a run.
+    """Return the checkpoint or bundle to export, with the reason for the choice. The folder may be outside of a run.
 
     The code of the task is imported only for a shipped policy, a bundle, or a task without a run: the checkpoints of
     runs are exported without this code.
@@ -188,7 +188,7 @@ def _find(reference: str | None, runs_dir: Path, task: str | None) -> Choice:
     Args:
         reference: value of --checkpoint; None: the newest run, or the policy that `task` ships if it has no run.
         runs_dir: the folder of runs.
-        task: name or folder of the task that the run must be of; None: any.
+        task: name or folder of a task: only its runs are searched; None: the runs of all tasks.
     """
     from rlcli.evaluation.session import named_task_or_run
     from rlcli.runs.policy_bundle import is_bundle

@@ -1,7 +1,7 @@
 """Command `rlcli lint`: search for properties of a task that make it hard to learn.
 
-The linter runs simple fixed policies (zero, random, bang-bang, sine) and checks their rollouts with one rule for each
-obstacle. `rlcli.testing.lint_rules.RULES` contains all rules.
+The linter runs simple fixed policies (zero, random, bang-bang, sine). Each of its rules searches their rollouts for one
+such property. `rlcli.testing.lint_rules.RULES` contains all rules.
 """
 
 from typing import TYPE_CHECKING, Annotated

@@ -1,4 +1,4 @@
-"""Command `rlcli play`: a policy that acts in a window, in the browser, in a video, or as printed values.
+"""Command `rlcli play`: run a policy and show it in a window, in the browser, in a video, or as printed values.
 
 It can also repeat one episode of an evaluation, and record episodes to a file.
 """
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 _FALLBACK_VIDEO = "play.mp4"
 _USUAL_ENVS = 16
-"""Number of environments of a video and of printed values, if neither the user nor the task's `play:` sets it."""
+"""Largest number of environments for a video or printed values, if neither --num-envs nor `play:` sets a number."""
 _MIN_VIDEO_S = 5.0
 """Shortest video [s] that may end with a terminated episode; a shorter one continues with the next episode."""
 
@@ -62,7 +62,7 @@ def command(
         drawn: Number of environments in the image, side by side at the distance scene.env_spacing.
         commands: Hold commands of the task (goals such as a velocity), as in vx=0.5,wz=0; repeatable. The error for a
             wrong name lists the valid names.
-        seconds: Length of the video at most, or time after which the window or page closes [s]. [default: no limit]
+        seconds: Maximum length of the video, or time after which the window or page closes [s]. [default: no limit]
         env: With --episode: index of the environment, from 0, whose episode of an evaluation is repeated.
         episode: With --env: index of the episode in that environment, from 0.
 
@@ -116,7 +116,8 @@ def _check_record(record: Path | None, mode: str, video: Path | None, commands: 
 def _check_seconds(seconds: float | None, viewer: str | None, record: Path | None, env: int | None) -> None:
     if seconds is not None and (viewer == "none" or record is not None or env is not None):
         raise UsageError(
-            "--seconds cannot be combined with --viewer none, --record or --env: it ends a video, a window or a page",
+            "--seconds cannot be combined with --viewer none, --record or --env: --seconds ends a video, a window or"
+            " a page",
             hint="leave out --seconds",
         )
 

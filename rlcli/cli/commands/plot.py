@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 _CURVES = Path("curves.png")
 _MAX_PANELS = 60
-"""Number of panels in one figure."""
+"""Largest number of panels in one figure."""
 
 
 def command(

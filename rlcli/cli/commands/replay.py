@@ -134,8 +134,8 @@ def _values(difference: Difference, word: str) -> str:
     """Return the field that differs, with its values in the file and in the replay.
 
     Args:
-        difference: the difference.
-        word: what the values in the file are called: recorded or dumped.
+        difference: the first difference between the file and the replay.
+        word: name for the values of the file in the text: recorded or dumped.
     """
     sides = []
     for values in (difference.recorded, difference.replayed):

@@ -41,7 +41,7 @@ def command(
         rlcli report latest
             Evaluate and film the newest run; write report.html into it.
         rlcli report latest@best -o page.html --no-video
-            Write a page about its best checkpoint, without a video.
+            Write a page about the best checkpoint of the newest run, without a video.
     """
     from rlcli.runs.run import require_own
     from rlcli.runs.run_ref import default_runs_dir

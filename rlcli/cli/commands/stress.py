@@ -52,7 +52,7 @@ def command(
             push [m/s or rad/s].
         points: Number of values in a range.
         episodes: Number of episodes in each variant.
-        worst: Number of further random variants within the ranges, half of them near the worst, to find a worse one.
+        worst: Number of further random variants within the ranges; half of them are near the worst variant of the grid.
         against: Other policy to compare with: lqr, zero or random.
         fail_under: Exit with code 9 if the mean is below X in any variant, such as success=0.9; repeatable.
         output: Write the heat map to FILE.png or FILE.svg.
@@ -61,7 +61,7 @@ def command(
         rlcli stress latest --sweep body_mass=0.5:2
             Evaluate the newest run with half to twice the mass, in five steps.
         rlcli stress cartpole --sweep action_delay=0:3 --against lqr -o map.png
-            Compare it with an LQR controller under delays, and write the map.
+            Compare the newest run of cartpole with an LQR controller under delays, and write the heat map.
     """
     from rlcli.evaluation.limits import read_limits, require_success
     from rlcli.evaluation.session import PolicyRequest, baseline, find_policy, split_overrides

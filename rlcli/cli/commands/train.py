@@ -194,7 +194,7 @@ def _train(request: TrainingRequest, resolved: Resolved | None, device: str, sto
                 _print(result)
         except KeyboardInterrupt:  # a second signal, at any point of the training
             raise Stopped(
-                "stopped without a new checkpoint; --resume uses the last one", exit_code=stop.exit_code
+                "stopped without a new checkpoint; --resume continues from the last one", exit_code=stop.exit_code
             ) from None
         finally:
             distributed.leave()
@@ -222,7 +222,7 @@ def _print(result: TrainingResult) -> None:
 
 
 def _next_steps(result: TrainingResult) -> list[str]:
-    """Return messages that explain the last success rate or return, and name commands that judge the policy."""
+    """Return messages with the last success rate or return, and with the commands that evaluate the policy."""
     from rlcli.runs.overview import newest_rows
     from rlcli.runs.run import Run
     from rlcli.training.progress import no_episode_note
@@ -240,7 +240,7 @@ def _next_steps(result: TrainingResult) -> list[str]:
         counts = f"counts the last episodes of the training{old and f' ({old})'}, with exploration noise"
         lines = [f"{figure} {counts}; without noise: rlcli eval --checkpoint {run}"]
     if success is None or success < _GOOD:
-        lines.append(f"compare it with a policy of zero actions: rlcli eval --compare {run} zero")
+        lines.append(f"to compare the policy with zero actions: rlcli eval --compare {run} zero")
     return lines
 
 

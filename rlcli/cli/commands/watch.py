@@ -47,7 +47,7 @@ def command(
 
 
 def _follow(run: Run) -> Overview:
-    """Show the run until it ends; return its final state."""
+    """Show the progress of a run until its training ends; return the final state."""
     from rlcli.cli.ui.progress_view import TrainingView
     from rlcli.errors import CheckpointError
     from rlcli.runs.overview import overview_of, state_of
@@ -90,7 +90,7 @@ def _report(final: Overview) -> None:
     if final.reason:
         console.info(final.reason)
     if final.state != "finished" and final.resumable:
-        console.info(f"rlcli train --resume {final.folder} continues it")
+        console.info(f"rlcli train --resume {final.folder} continues the training")
 
 
 def _document(run: Run) -> None:

@@ -1,6 +1,6 @@
 """Functions that complete words of a command line when the user presses Tab: tasks, runs, checkpoints, agents.
 
-The options of commands name them as their completion. They are fast, because no plugin is imported.
+`options` connects each option with one of these functions. The functions are fast: they import no plugin.
 """
 
 from collections.abc import Callable, Iterator
@@ -46,7 +46,7 @@ def runs(ctx: typer.Context, incomplete: str) -> list[Offer]:
 
 
 def checkpoints(ctx: typer.Context, incomplete: str) -> list[Offer]:
-    """Return the newest runs, `latest` and `shipped`; for a word that begins with `RUN@`, the run's checkpoints."""
+    """Return `shipped`, `latest` and the newest runs; for a word that begins with `RUN@`, the run's checkpoints."""
     run, at, _ = incomplete.partition("@")
     if at:
         return _starting([(f"{run}@{name}", "") for name in _checkpoint_names(ctx, run)], incomplete)

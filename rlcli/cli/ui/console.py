@@ -33,7 +33,7 @@ _NO_READER = (errno.EPIPE, errno.EIO)
 
 @dataclass(slots=True)
 class Console:
-    """Writer for the output of a command: data, messages and the JSON document, as --json, -q and -v demand."""
+    """Writer for the output of a command: result, messages and JSON document. --json, -q and -v set what is printed."""
 
     json: bool = False
     quiet: bool = False
@@ -44,7 +44,7 @@ class Console:
     owns_process: bool = False
     """Whether this process runs only this command; False if Python code has called `main(arguments)`."""
     has_document: bool = False
-    """Whether the JSON document is printed; an error after that, such as Ctrl-C, prints no second one."""
+    """Whether the JSON document is printed; an error after that, such as Ctrl-C, prints no second document."""
     has_line: bool = False
     """Whether the last line of the terminal shows progress; further output first erases this line."""
     out: Any = None
@@ -64,7 +64,7 @@ class Console:
             self.out = None
 
     def clear_line(self) -> None:
-        """Erase the line of progress from the terminal, if the last line is one (`has_line`)."""
+        """Erase the last line of the terminal if it shows progress (`has_line`)."""
         if self.has_line and sys.stderr is not None:
             self.has_line = False
             with contextlib.suppress(OSError, ValueError):  # the terminal may be closed
@@ -77,7 +77,12 @@ class Console:
             _write(sys.stdout, *lines)
 
     def document(self, command: str, **content: Any) -> None:
-        """Print the result as JSON; without --json print nothing."""
+        """Print the result as one JSON object; without --json print nothing.
+
+        Args:
+            command: name of the command, the value of the key `command`.
+            content: further keys and values of the object.
+        """
         if self.json and not self.muted:
             self.has_document = True
             self._write_json(command=command, **content)
@@ -191,7 +196,7 @@ def plain(text: str) -> str:
 
 def output_error(error: OSError) -> MachineError:
     """Return the error that stdout cannot be written, with the reason of the operating system."""
-    return MachineError(f"cannot write the output: {error.strerror or error}", hint="redirect it to another place")
+    return MachineError(f"cannot write the output: {error.strerror or error}", hint="redirect stdout to another file")
 
 
 def redirect_to_null(stream: Any) -> None:

@@ -31,8 +31,8 @@ def report_findings(
         command: `check` or `lint`.
         task: the task as the user typed it.
         kind: `check` or `rule`.
-        results: names of the checks or rules with their findings; None instead of findings: it did not run.
-        records: all findings as JSON data, for the document.
+        results: names of the checks or rules with their findings; None instead of findings: the check did not run.
+        records: all findings as JSON data, for the output of --json.
         notes: name of a check -> a remark that is not a problem.
         fail_on_warnings: whether a task with warnings fails.
     """

@@ -1,4 +1,4 @@
-"""Choice and opening of the viewer for `rlcli play`; afterwards the JSON document is printed."""
+"""Choice and opening of the viewer for `rlcli play`, and the check of its options --viewer, --port and --command."""
 
 from __future__ import annotations
 
@@ -63,10 +63,10 @@ def read_commands(texts: Sequence[str]) -> dict[str, float]:
 
 
 def choose_viewers(viewer: str | None, port: int | None, *, headless: bool) -> list[Choice]:
-    """Return the viewers to try, in this order; the error of the last one is raised to the user.
+    """Return the viewers that `show` tries in this order, until one opens.
 
     Args:
-        viewer: the value of --viewer; None: the user's settings choose, if they have a viewer.
+        viewer: the value of --viewer; None: the viewer in the user's settings, if there is one, else as for auto.
         port: the value of --port.
         headless: whether opening a viewer is forbidden.
 
@@ -94,7 +94,7 @@ def choose_viewers(viewer: str | None, port: int | None, *, headless: bool) -> l
     in_terminal = all(stream is not None and stream.isatty() for stream in (sys.stdin, sys.stdout))
     display = "no display" if not has_display() else "no window"
     fallbacks: list[Choice] = [
-        ("none", f"{display}, and not started from a terminal; --viewer web shows it in the browser")
+        ("none", f"{display}, and not started from a terminal; --viewer web shows the policy in the browser")
     ]
     if in_terminal:
         fallbacks = [("web", f"{display}; --viewer none prints numbers"), ("none", "no viewer works here")]

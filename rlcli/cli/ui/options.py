@@ -264,18 +264,19 @@ def check_output(output: Path | None, what: str, suffixes: Sequence[str]) -> Non
         suffixes: the allowed suffixes, such as `.png`.
 
     Raises:
-        UsageError: for a suffix that is not one of `suffixes`, or something else than a regular file.
-        MachineError: if its folder does not exist or takes no files.
+        UsageError: if the suffix is not one of `suffixes`, or the path exists and is not a regular file.
+        MachineError: if the folder of the file does not exist or cannot be written.
     """
     from rlcli.runs.atomic_io import require_regular, require_writable
 
     if output is None:
         return
     if output.suffix.lower() not in suffixes:
-        raise UsageError(f"'{output}' is not a {what}", hint=f"its name must end in {' or '.join(suffixes)}")
+        raise UsageError(f"'{output}' is not a {what}", hint=f"the name must end in {' or '.join(suffixes)}")
     require_regular(output)
     if not output.absolute().parent.is_dir():
-        raise MachineError(f"cannot write {output}: there is no folder {output.absolute().parent}; create it")
+        folder = output.absolute().parent
+        raise MachineError(f"cannot write {output}: there is no folder {folder}; create this folder")
     require_writable(output)
 
 

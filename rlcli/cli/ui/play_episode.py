@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from rlcli.viewer.video_writer import VideoWriter
 
 _MAX_REASONS = 6
-"""Number of reasons that one message lists at most; they say why earlier episodes had to be run first."""
+"""Largest number of reasons in one message, which lists why earlier episodes of the environment had to run first."""
 
 
 def check_choice(
@@ -42,7 +42,7 @@ def check_choice(
     if num_envs is not None and num_envs <= env:
         raise UsageError(
             f"--env {env} does not exist: --num-envs is {num_envs}, and environments are counted from 0",
-            hint=f"give --num-envs {env + 1}, or leave it out",
+            hint=f"give --num-envs {env + 1}, or leave out --num-envs",
         )
     if record_mode != "all":
         raise UsageError("--env and --episode choose one episode; leave out --record-mode, which chooses several")
@@ -124,8 +124,8 @@ def _print_origin(session: Session, start: EpisodeStart, env_id: int, episode: i
 def _origin(session: Session, start: EpisodeStart, env_id: int, episode: int) -> dict[str, Any]:
     """Return JSON data that identify the repeated episode; warn if it depends on the number of environments.
 
-    An episode depends on --num-envs if the task draws from a random generator that all environments share. Whether
-    it does is known only after the episode: call this function then.
+    An episode depends on --num-envs if the task draws from a random generator that all environments share. This is
+    known only after the episode, so call this function then.
     """
     shared = start.shared_draws()
     if shared:
@@ -160,7 +160,7 @@ class FilmedPolicy:
         return self.writer.frames / self.writer.fps
 
     def act(self, obs: Tensor) -> Tensor:
-        """Render the state if a frame is due; return the action. obs: (num_envs, obs_size)"""
+        """Render the state if a frame is due; return the action (num_envs, action_size). obs: (num_envs, obs_size)"""
         env = self.session.env
         if not self.ended and int(env.episode_length_buf[self.env_id]) % self.stride == 0:
             self.writer.add(self.renderer.image(env, self.env_id))
@@ -176,6 +176,9 @@ def film(session: Session, file: Path, env_id: int = 0, drawn: int = 1) -> Itera
         file: an .mp4 or .gif; it is created when the video is complete.
         env_id: the environment in the foreground.
         drawn: number of environments in the image.
+
+    Yields:
+        The policy; each call of its `act` adds a frame to the video, if one is due.
     """
     from rlcli.viewer.env_grid import EnvGrid
     from rlcli.viewer.record_video import open_video

@@ -59,14 +59,14 @@ class LiveView:
                 self._live.__exit__(*error)
 
     def update(self, lines: Sequence[str], *, refresh: bool = False) -> None:
-        """Replace the lines of the live block; `refresh` draws it at once."""
+        """Replace the lines of the live block; with `refresh` draw the block at once. Needs a terminal."""
         from rich.text import Text
 
         self._live.update(Text("\n".join(lines)), refresh=refresh)
 
 
 class WorkView:
-    """View of a command's progress (`rlcli.progress`): one line on a terminal, else a new line every ten seconds."""
+    """View of a command's progress (`rlcli.progress`): one line, redrawn on a terminal, else a new line every 10 s."""
 
     def __init__(self, running: list[Work]) -> None:
         self._running = running
@@ -111,7 +111,7 @@ def work_line(running: Sequence[Work]) -> str:
     """Return one line about the running work: names with counts, percentage, time left.
 
     Args:
-        running: parts of the command that are being done now, the outermost first; parts of several threads are mixed.
+        running: unfinished parts of the command, the outermost first; parts of several threads are mixed.
     """
     works = list(running)
     counts = [work.text() for work in works]
@@ -225,7 +225,7 @@ def _left(progress: Progress) -> str:
 
 
 def duration_text(seconds: float) -> str:
-    """Return a duration [s] as `h:mm:ss`; `?` if it is negative or endless."""
+    """Return a duration [s] as `m:ss`, or `h:mm:ss` from one hour on; `?` if it is negative, or 1e10 s or longer."""
     if not 0.0 <= seconds < _MAX_S:
         return "?"
     minutes, left = divmod(int(seconds), 60)

@@ -31,7 +31,7 @@ def print_study(result: StudyResult) -> None:
     if result.together is not None:
         _print_table(result.runs, result.together)
     if result.stop_code is not None:
-        hint = f"rlcli train --resume {result.folder} continues it"
+        hint = f"rlcli train --resume {result.folder} continues the study"
         raise Stopped("stopped on request", exit_code=result.stop_code, hint=hint)
     console.data(str(result.folder))
     console.document(
@@ -73,7 +73,7 @@ class SeedsView(LiveView):
         self._last = time.monotonic()
 
     def poll(self) -> None:
-        """Update the view if the last update is old enough."""
+        """Update the view if the last update was at least 1 s ago (without a terminal: 10 s)."""
         now = time.monotonic()
         if now - self._last < (1.0 if self._live is not None else _LINE_EVERY_S) or console.quiet:
             return
@@ -94,7 +94,7 @@ def _cells(run: Overview) -> list[str]:
 
 
 def print_sweep(sweep: Sweep) -> None:
-    """Print the trials of a sweep and how to train with the best one's settings, as a table and as a JSON document."""
+    """Print the trials of a sweep, and the command that trains with the best trial's settings; with --json, as JSON."""
     settings, best = sweep.settings, sweep.best()
     rows, documents = [], {}
     for trial in sweep.trials():
@@ -106,7 +106,7 @@ def print_sweep(sweep: Sweep) -> None:
     console.table(["TRIAL", "STATE", settings["objective"].upper(), *(p.key for p in sweep.parameters), ""], rows)
     file = sweep.folder / PRESET
     if best is not None:
-        run = documents[best.number]["run"] or "on the machine that trained it"
+        run = documents[best.number]["run"] or "on the machine that trained this trial"
         console.info(f"best: trial {best.number}; its run: {run}")
         console.info(f"to train with its settings: rlcli train {task_reference(settings['source'])} --config {file}")
     if (same := sweep.same_objective()) is not None:

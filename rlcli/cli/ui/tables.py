@@ -17,7 +17,10 @@ _MIN_BROKEN = 24
 
 
 def fill(parts: Sequence[str], width: int, indent: int = 0) -> list[str]:
-    """Arrange parts of text side by side, in lines of at most `width` characters; a longer part has its own line."""
+    """Arrange parts of text side by side, in lines of at most `width` characters; a longer part gets its own line.
+
+    Each line starts with `indent` spaces.
+    """
     lines: list[str] = []
     line = ""
     for part in parts:
@@ -58,7 +61,14 @@ def draw_table(columns: Sequence[str], rows: Sequence[Sequence[str]], title: str
 def draw_map(
     heading: Sequence[str], columns: Sequence[str], rows: Sequence[Sequence[str]], styles: Sequence[Sequence[str]]
 ) -> None:
-    """Print a heat map on the terminal at stdout; columns that do not fit are printed below the others."""
+    """Print a heat map on the terminal at stdout; columns that do not fit are printed below the others.
+
+    Args:
+        heading: parts of the title.
+        columns: names of the columns.
+        rows: name of each row, followed by the texts of its cells.
+        styles: rich's style of each cell, without the names.
+    """
     from rich.table import Table
     from rich.text import Text
 

@@ -28,7 +28,10 @@ def supports_styles(stream: TextIO | None) -> bool:
 
 
 def color_mode() -> str:
-    """Return never, always or auto (only on a terminal), from NO_COLOR, FORCE_COLOR or the user's settings."""
+    """Return when to print colors: never, always or auto (only on a terminal).
+
+    The environment variable NO_COLOR comes first, then FORCE_COLOR, then the user's settings.
+    """
     if os.environ.get("NO_COLOR"):
         return "never"
     if os.environ.get("FORCE_COLOR"):

@@ -103,7 +103,7 @@ def test_figure_has_chosen_metrics_and_axis(cli, runs):
         (["latest", "--metrics", "retrun"], 2, "did you mean 'return'"),
         (["latest", "--metrics", ","], 2, "--metrics names no metric"),
         (["latest", "--x", "step"], 2, "did you mean 'steps'"),
-        (["latest", "-o", "x.jpg"], 2, "its name must end in .png or .svg or .pdf"),
+        (["latest", "-o", "x.jpg"], 2, "the name must end in .png or .svg or .pdf"),
         (["latest", "-o", "runs"], 2, "is not a picture"),
         (["latest", "-o", "folder.png"], 2, "is a folder"),
         (["latest", "-o", "nowhere/x.png"], 10, "cannot write nowhere/x.png"),

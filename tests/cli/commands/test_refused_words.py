@@ -28,7 +28,7 @@ def test_empty_word_is_refused_with_its_option(cli, words, option):
     done = cli(*words)
     assert (done.code, done.err) == (
         2,
-        f"error: there is an empty word after {option}\nhint: give a value, or leave it out\n",
+        f"error: there is an empty word after {option}\nhint: write a value there, or leave out the empty word\n",
     )
 
 

@@ -97,7 +97,8 @@ def test_play_prints_viewer_and_reason(cli):
     done = cli(*ZERO)
     assert done.code == 0
     assert (
-        "viewer: none (no display, and not started from a terminal; --viewer web shows it in the browser)" in done.err
+        "viewer: none (no display, and not started from a terminal; --viewer web shows the policy in the browser)"
+        in done.err
     )
     assert "viewer: none (--viewer is given)" in cli(*ZERO, "--viewer", "none").err
     assert cli(*ZERO, "--json").json["video"] is None
