@@ -40,10 +40,10 @@ def code_origin(places: Mapping[tuple[str | int, ...], str], path: tuple[str | i
 
 
 def short_path(path: Path) -> Path:
-    """Return a path relative to the current folder if it is below it, else unchanged."""
+    """Return the path relative to the current folder; a path outside of this folder is returned unchanged."""
     return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
 
 
 def at_place(error: ConfigError, place: str) -> ConfigError:
-    """Return the error with `place` added as the location of all its problems that have no location yet."""
+    """Return a copy of the error in which `place` is the location of all problems that had none."""
     return ConfigError([replace(p, where=place) if p.where == "configuration" else p for p in error.problems])

@@ -1,6 +1,6 @@
 """Reader of the strings below the fields of a pydantic model, which document the fields.
 
-They become the descriptions in the JSON Schema, and so in the reference pages and in editors.
+These strings become the descriptions in the JSON Schema, which the reference pages and editors show.
 """
 
 import ast

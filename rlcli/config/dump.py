@@ -65,9 +65,9 @@ _Dumper.add_representer(list, _sequence)
 
 
 def to_data(resolved: Resolved) -> dict[str, Any]:
-    """Return the whole configuration as plain data, as YAML or JSON can hold it.
+    """Return the whole configuration as plain data: mappings, lists, texts, numbers, true/false and null.
 
-    The data contains all defaults, the changes by the chosen agent and by `play:`, and only the chosen agent.
+    All defaults are written out, and all changes are applied. Of the agents, the data has only the chosen one.
     """
     data = resolved.task.model_dump(mode="json", exclude={"agents"})
     data |= data.pop("foreign")
@@ -180,7 +180,7 @@ def json_schema(vocabulary: Vocabulary, params: type[BaseModel] | None = None) -
 
     Args:
         vocabulary: the terms that the file may name; their parameters are part of the schema.
-        params: the model of a direct task's parameters; None: they are not described.
+        params: the model of a direct task's parameters; None: the schema does not describe parameters.
     """
     schema = TaskConfig.model_json_schema()
     definitions = schema.setdefault("$defs", {})

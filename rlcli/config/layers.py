@@ -252,7 +252,7 @@ def without(data: Any, paths: Iterable[Path]) -> Any:
 
 def _index(target: list[Any], step: str | int, taken: Path) -> int:
     if not str(step).isdecimal() or int(step) >= len(target):
-        allowed = f"give an index from 0 to {len(target) - 1}" if target else "it has no items to change"
+        allowed = f"give an index from 0 to {len(target) - 1}" if target else "the list has no items"
         raise LookupError(f"'{taken[-1]}' is a list of length {len(target)} without item '{step}'; {allowed}")
     return int(step)
 

@@ -43,7 +43,7 @@ class Resolved:
     trainer: TrainerSpec | None
     """Trainer of the agent; None without an agent."""
     layers: Layers
-    """The files, flags and overrides that set the values."""
+    """The merged values of all files, flags and overrides before validation, and the origin of each value."""
     vocabulary: Vocabulary
     """Signatures of the terms that the task may name."""
     notes: tuple[Note, ...] = ()

@@ -77,7 +77,7 @@ def dotted(path: Path) -> str:
 
 
 def format_value(value: object) -> str:
-    """Return a value as it would be written in YAML, cut to 60 characters."""
+    """Return a value as text for a message, cut to 60 characters; a mapping becomes the words `a mapping`."""
     if isinstance(value, dict):
         return "a mapping"
     return shorten(repr(value) if isinstance(value, str) else json.dumps(value, default=repr), 60)

@@ -1,6 +1,6 @@
 """Reader of the option `--model`, with which users give MJCF files for tasks of other frameworks.
 
-The files of such tasks name robots as USD or URDF assets, which rlcli cannot simulate, and no MJCF.
+Such tasks name USD or URDF files of their robots, which rlcli cannot simulate; the option gives MJCF files instead.
 """
 
 from collections.abc import Iterable, Mapping
@@ -16,7 +16,7 @@ from rlcli.registry.models import model_file
 MODELS = "models"
 """First key of the overrides that `--model` becomes."""
 OPTIONAL = "optional"
-"""Key of a model from a file of `--model`: the file may have names that the task's scene lacks."""
+"""Key that marks a model from `--model FILE.yaml`: its name need not exist in the task's scene."""
 
 
 def read_models(words: Iterable[str]) -> dict[str, Any]:

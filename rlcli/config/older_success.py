@@ -1,6 +1,6 @@
 """Conversion of the key `success` in runs of earlier versions of rlcli to the present form.
 
-Earlier it was one function, `{func: ...}`; now it is a mapping of named conditions, `{NAME: {func: ...}}`.
+Earlier the key had one function, `{func: ...}`; now it has a mapping of named conditions, `{NAME: {func: ...}}`.
 """
 
 from collections.abc import Mapping

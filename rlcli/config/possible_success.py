@@ -21,5 +21,5 @@ def impossible_conditions(task: TaskConfig, layers: Layers) -> Iterator[Problem]
         low, high = condition.at_least, condition.at_most
         if low is not None and high is not None and low > high:
             path = ("success", name, "at_least")
-            message = f"expected at most at_most, {high:g}, found {low:g}"
-            yield Problem(layers.place(path), dotted(path), message, "no value could meet both: correct one of them")
+            message = f"at_least is {low:g} and above at_most, which is {high:g}: no value meets both bounds"
+            yield Problem(layers.place(path), dotted(path), message, "correct one of the two bounds")

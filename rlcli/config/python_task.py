@@ -49,7 +49,7 @@ class PythonTask:
     notes: list[Note] = field(default_factory=list)
     """How each setting was translated, for a configuration of another framework."""
     params: type[BaseModel] | None = None
-    """Model of `params` in `data`, the settings of the code of a task of another framework; None: it has none."""
+    """Model of `params` in `data`: settings that the code of another framework's task reads; None: it reads none."""
     format: Format | None = None
     """The other framework's format to whose classes the configuration belongs; None: rlcli's own."""
     places: dict[Path, str] = field(default_factory=dict)
@@ -145,7 +145,8 @@ def to_task(
         task = PythonTask(value)
     if not isinstance(task.data, TaskConfig | Mapping):
         found = f"expected a TaskConfig, found a value of type {type(task.data).__name__}"
-        raise ConfigError([Problem(label, "", found, "write a TaskConfig, or a function that returns one")])
+        hint = "write a TaskConfig, a mapping with its keys, or a function that returns one of them"
+        raise ConfigError([Problem(label, "", found, hint)])
     task.data = _PlainData(task.terms, label).read(task.data)
     return task
 
@@ -253,7 +254,7 @@ def _import_configuration(source: TaskSource) -> tuple[Any, dict[str, Any]]:
     for part in attribute.split("."):
         if not hasattr(value, part):
             names = [n for n in vars(value) if not n.startswith("_")]
-            raise TaskError(f"{file} has no '{part}'", hint=f"it has {listing(names)}")
+            raise TaskError(f"{file} has no '{part}'", hint=f"names there: {listing(names)}")
         value = getattr(value, part)
     if agents or not hasattr(value, "__rlcli_task__"):
         return value, agents
@@ -307,7 +308,7 @@ def _registered(source: TaskSource) -> tuple[Any, dict[str, Any]]:
     if wanted in registrations:  # the configuration may belong to another package
         found[wanted] = registrations[wanted]
     if wanted and wanted not in found:
-        known = did_you_mean(wanted, found) or f"it registers {listing(found)}"
+        known = did_you_mean(wanted, found) or f"registered tasks: {listing(found)}"
         known = "; ".join(take_failures()) or known
         raise TaskError(f"{source.root} does not register a task '{wanted}'", hint=known)
     if not wanted and len(found) != 1:

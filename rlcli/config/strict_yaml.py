@@ -74,7 +74,7 @@ def load(text: str | bytes) -> Document:
 
 
 def load_value(text: str) -> Any:
-    """Parse one value, such as `1e-3`, `[1, 2]`, `{a: 1}` or `text`, as it would be read after a key.
+    """Parse one value, such as `1e-3`, `[1, 2]`, `{a: 1}` or `text`, like VALUE in the YAML `key: VALUE`.
 
     Raises:
         YamlError: with the position of the first mistake.
@@ -215,7 +215,7 @@ class _Reader:
                 raise YamlError("a key must be text, not a list or mapping; write `name: value`", event.start_mark)
             key = _scalar(event, key=True)
             if not isinstance(key, str):
-                raise YamlError(f"keys must be text, found {key!r}; quote it", event.start_mark)
+                raise YamlError(f"keys must be text, found {key!r}; write the key in quotes", event.start_mark)
             below = (*path, key)
             if key in found:
                 first = self.marks[below][0]
@@ -237,7 +237,11 @@ def _position(event: events.Event) -> Mark:
 
 
 def check_scalar(event: events.ScalarEvent) -> str:
-    """Return the text of a scalar, which has at most `MAX_SCALAR` characters and no half of a surrogate pair."""
+    """Return the text of a scalar.
+
+    Raises:
+        YamlError: if the text has more than `MAX_SCALAR` characters, or half of a surrogate pair.
+    """
     text: str = event.value
     if len(text) > MAX_SCALAR:
         raise YamlError(f"the value is longer than {MAX_SCALAR} characters; shorten it", event.start_mark)
@@ -265,7 +269,8 @@ def _scalar(event: events.ScalarEvent, *, key: bool) -> Any:
     if text in _CONSTANTS:
         return _CONSTANTS[text]
     if _OCTAL.match(text):
-        raise YamlError(f"{text} is ambiguous (octal in YAML 1.1); remove the leading 0 or quote it", event.start_mark)
+        message = f"{text} is ambiguous (octal in YAML 1.1); remove the leading 0, or write the value in quotes"
+        raise YamlError(message, event.start_mark)
     if (number := read_number(text)) is not None:
         if math.isinf(number):
             raise YamlError(f"the number {text[:20]} is out of range; allowed: up to 1.8e308", event.start_mark)

@@ -120,7 +120,7 @@ class Vocabulary:
         return cls(own)
 
     def find(self, section: str, name: str) -> Signature | None:
-        """Return the term `name` of a section, or None."""
+        """Return the signature of the term `name` in a section; None if there is no such term."""
         return self.own.get(name) or builtin_terms(section).get(name)
 
     def names(self, section: str) -> list[str]:
@@ -188,9 +188,9 @@ def signature_of(term: Any, name: str) -> Signature:
 
 
 def read_params(file: Path, class_name: str) -> type[schema.StrictModel] | None:
-    """Return a model with the fields of a direct task's class `Params`, read from its source code; None without it.
+    """Return a pydantic model with the fields of a direct task's class `Params`, read from source code.
 
-    `Params` is inside of the task's class or of one of its base classes.
+    `Params` is inside of the task's class or of one of its base classes; if there is no `Params`, return None.
 
     Raises:
         SyntaxError: if a file is not Python.

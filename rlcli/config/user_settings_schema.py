@@ -1,6 +1,6 @@
 """Schema of the user's settings file: folder of runs, loggers, viewer, verbosity, colours, plugins.
 
-`rlcli.config.user_settings` validates the file with it.
+`rlcli.config.user_settings` validates the file with this schema.
 """
 
 from typing import Annotated, Literal

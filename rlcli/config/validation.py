@@ -88,7 +88,12 @@ class TaskCheck:
     places: dict[Path, str] = field(default_factory=dict)  # `PythonTask.places`
 
     def document(self, changes: Iterable[Change] = ()) -> Document:
-        """Return the content of the task's file; for one in Python, `changes` supply models and required values."""
+        """Return the content of the task's file, before any change.
+
+        Args:
+            changes: changes from the command line. For a task in Python they may contain MJCF files (--model) and
+                required values that the task's code does not set.
+        """
         file = self.source.config  # YAML: a task, or the record of a run
         recorded = upgraded(read(file, self.source.label), file) if file.suffix != ".py" else None
         if recorded is not None and self.source.python is None and self.source.value is None:
@@ -112,7 +117,13 @@ class TaskCheck:
             raise ConfigError([Problem(self.source.label, "", text), *self.problems[:MAX_PROBLEMS]])
 
     def problem(self, path: Path, message: str, hint: str | None = None) -> None:
-        """Add a problem with the value at a path."""
+        """Add a problem with the value at a path of the merged configuration.
+
+        Args:
+            path: keys of the value.
+            message: what is wrong.
+            hint: what to write instead.
+        """
         self.add(Problem(self.layers.place(path), messages.dotted(path), message, hint))
 
     def _is_mapping(self, value: object, path: Path) -> bool:
@@ -215,7 +226,7 @@ class TaskCheck:
         """Add the problem that the change `agent.x` at location `where` applies to no agent, because none is chosen."""
         names = agent_names(self.layers)
         if not names:
-            self.add(Problem(where, "agent", "this task has no agents; add agents: to its YAML"))
+            self.add(Problem(where, "agent", "this task has no agents; add `agents:` to the task's YAML"))
         elif not self.problems:  # otherwise the choice of the agent was wrong and is reported already
             hint = f"name one: --agent {' or '.join(names)}"
             self.add(Problem(where, "agent", "the task has several agents and no default", hint))
@@ -232,7 +243,12 @@ class TaskCheck:
         self.layers.merge(task, lambda path: Origin(layer, self.layers.place(at + path)))
 
     def apply(self, changes: Iterable[Change], name: str | None) -> None:
-        """Set the values of overrides and flags. `agent.KEY=VALUE` changes agent `name`; None: it is a problem."""
+        """Set the values of overrides and flags in `layers`.
+
+        Args:
+            changes: the changes.
+            name: the agent that `agent.KEY=VALUE` changes; None: such a change is added to `problems`.
+        """
         format_keys = functools.cache(formats.format_keys)  # slow: it looks for installed plugins
         for path, value, origin in changes:
             if path[0] == "agent":
@@ -403,7 +419,7 @@ class TaskCheck:
         return checked.model_dump() if checked is not None else None
 
     def params_model(self) -> type[BaseModel] | None:
-        """Return the model of a direct task's parameters; None if it has none."""
+        """Return the pydantic model of a direct task's parameters; None if the task has no parameters."""
         if self.params is not None or self.source.task is None or self.source.task_file is None:
             return self.params
         try:

@@ -85,7 +85,7 @@ TYPOS = [
     ("success={near: {func: joint_error, joints: [a], at_most: 1, hold_s: -1}}", "success.near.hold_s: expected", None),
     (
         "success={near: {func: joint_error, joints: [a], at_least: 2, at_most: 1}}",
-        "success.near.at_least: expected at most at_most, 1, found 2",
+        "success.near.at_least: at_least is 2 and above at_most, which is 1: no value meets both bounds",
         None,
     ),
     ("agent.gamma=2", "agents.one.gamma: expected a number <= 1, found 2", None),

@@ -58,8 +58,8 @@ class AgentConfig(StrictModel):
     max_steps: Length | None = None
     """Number of environment steps of the training, summed over all environments; null: no limit."""
     max_minutes: Positive | None = None
-    """Number of minutes after which a training stops with a checkpoint; a resumed training may take as long. null:
-    no limit. Schedules follow `max_iterations` and `max_steps` only."""
+    """Number of minutes after which a training stops with a checkpoint; each time the training is resumed, it may take
+    this time again. null: no limit. Schedules follow `max_iterations` and `max_steps` only."""
     save_interval: Length | None = None
     """Iterations between two checkpoints; null: a checkpoint every 60 s and one at the end."""
     keep_last: Count | None = None
@@ -73,9 +73,10 @@ class AgentConfig(StrictModel):
     eval_episodes: Annotated[int, Field(ge=1, le=1_000_000)] = 100
     """Number of episodes of each evaluation of `eval_interval`; the training waits for their end."""
     until: Annotated[str, AfterValidator(_check_threshold)] | None = None
-    """Threshold at which training ends before its budget: success=X, return=X or length=X. It is reached when the lower
-    end of an evaluation's 95 % interval is at least X. With a threshold, `eval_interval: null` means a twentieth of the
-    budget, and `eval_episodes` is raised to the number that the interval of a success rate needs."""
+    """Threshold at which training ends before its budget: success=X, return=X or length=X. The training ends when the
+    lower end of the 95 % confidence interval of an evaluation is at least X. With a threshold, `eval_interval: null`
+    means a twentieth of the budget, and `eval_episodes` is raised to the number of episodes that a success rate of X
+    needs."""
     autopsy: AutopsyConfig | None = AutopsyConfig()
     """Recording of failed and outlier episodes during training on a CPU; null: no recording."""
     torch_threads: Threads | None = None

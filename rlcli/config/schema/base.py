@@ -80,7 +80,7 @@ class _Limits:
 
 
 Number = Annotated[float, _FractionString(), _Limits(-1e38, 1e38)]
-"""Finite number; like all numbers below that need not be whole, it may be written as a fraction: `1/120`."""
+"""Finite number. This and all number types below, except those of whole numbers, also accept a fraction: `1/120`."""
 Positive = Annotated[float, Field(gt=0), _FractionString(), _Limits(1e-38, 1e38)]
 """Number above 0."""
 NotNegative = Annotated[float, Field(ge=0), _FractionString(), _Limits(0.0, 1e38)]
@@ -90,7 +90,7 @@ Seconds = Annotated[float, Field(gt=0), _FractionString(), _Limits(0.0, 1e9)]
 Count = Annotated[int, Field(ge=1), _Limits(1, 2**31 - 1)]
 """Whole number of at least 1."""
 Length = Annotated[int, Field(ge=1), _Limits(1, 2**62)]
-"""Number of steps or iterations of a training: a very large one means that the training does not end by itself."""
+"""Number of steps or iterations of a training, 1 to 2**62."""
 Width = Annotated[int, Field(ge=1, le=2**24)]
 """Number of units of a layer of a network."""
 Widths = Annotated[tuple[Width, ...], Field(min_length=1, max_length=100)]
@@ -112,7 +112,7 @@ Range = Annotated[tuple[Number, Number], AfterValidator(_check_order)]
 """Two numbers [low, high]; low is not above high."""
 _SecondsOrZero = Annotated[float, Field(ge=0), _FractionString(), _Limits(0.0, 1e9)]
 SecondsRange = Annotated[tuple[_SecondsOrZero, _SecondsOrZero], AfterValidator(_check_order)]
-"""Two times of at least 0, [low, high]."""
+"""Two times of at least 0 [s], [low, high]."""
 ShareRange = Annotated[tuple[Share, Share], AfterValidator(_check_order)]
 """Two numbers from 0 to 1, [low, high]."""
 _Steps = Annotated[int, Field(ge=0, le=1000)]
@@ -123,7 +123,7 @@ Names = str | Annotated[list[str], Field(min_length=1)]
 
 
 class StrictModel(BaseModel):
-    """Base class of all configuration models. It refuses unknown keys, wrong types, NaN and later changes."""
+    """Base class of all configuration models: it refuses unknown keys, wrong types and NaN, and cannot be changed."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
     _defined_in: ClassVar[ModuleType | None]
@@ -136,8 +136,8 @@ class StrictModel(BaseModel):
     def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
         """Add the docstrings below the fields to the JSON Schema.
 
-        They are read only when a schema is generated. Pydantic's `use_attribute_docstrings` reads them when the classes
-        are created, which then takes 1.5 times as long.
+        The docstrings are read only when a schema is generated. Pydantic's `use_attribute_docstrings` reads them when
+        the classes are created, which then takes 1.5 times as long.
         """
         from rlcli.config.docstrings import describe
 

@@ -205,7 +205,7 @@ class EntityConfig(StrictModel):
     @model_validator(mode="after")
     def _one_kind(self, info: ValidationInfo) -> Self:
         if (self.model or "").startswith("file:") and not (info.context or {}).get("given_models"):
-            raise ValueError(f"'{self.model}' lies outside the task's folder; move it inside")
+            raise ValueError(f"'{self.model}' lies outside the task's folder; move the file into this folder")
         if (self.model is None) == (self.shape is None):
             raise ValueError("an entity has either `model` (an MJCF file) or `shape`: write one of the two")
         if self.shape is not None:

@@ -18,7 +18,7 @@ class TouchedConfig(StrictModel):
     entity: str
     """Entity whose bodies are touched."""
     bodies: Names | None = None
-    """Names or regexes of its bodies; null: all bodies."""
+    """Names or regexes of bodies of the entity; null: all its bodies."""
 
 
 class ContactSensorConfig(StrictModel):
@@ -29,8 +29,8 @@ class ContactSensorConfig(StrictModel):
     entity: str = "robot"
     """Entity that has the sensor's bodies."""
     bodies: Names
-    """Names or regexes of its bodies. Each body has one column, in this order. A body without a geom that can touch
-    anything reads 0; at least one must have such a geom."""
+    """Names or regexes of bodies of the entity. The sensor's values have one column for each body, in this order. A
+    body without a geom that can collide reads 0; at least one body must have such a geom."""
     against: Literal["ground"] | TouchedConfig | None = None
     """The other side of the contacts: ground (the plane or the terrain) or bodies of an entity; null: everything."""
     history: Count = 1
@@ -79,8 +79,8 @@ class RaySensorConfig(StrictModel):
     MuJoCo geom groups (0 to 5)."""
     lookup: bool = False
     """true: rays that point straight down read the ground from the terrain's table of heights. The distances are equal
-    up to rounding, and the sensor is much faster on a GPU. It needs a terrain without boxes, and alignment yaw or
-    world."""
+    up to rounding, and the sensor is much faster on a GPU. `lookup` needs a terrain without boxes, and alignment yaw
+    or world."""
 
     @model_validator(mode="after")
     def _straight_down(self) -> Self:
@@ -135,10 +135,10 @@ class CameraSensorConfig(StrictModel):
             keys = ", ".join(placed)
             raise ValueError(f"a camera of the MJCF has its own position and field of view: remove {keys}")
         if self.data == "segmentation" and self.samples > 1:
-            raise ValueError("ids of bodies have no mean: remove samples")
+            raise ValueError("segmentation gives ids of bodies, which have no mean over samples: remove samples")
         if self.clip[0] >= self.clip[1]:
             raise ValueError(
-                f"clip must be [nearest, farthest] in metres; {self.clip[0]:g} is not below {self.clip[1]:g}"
+                f"clip must be [near, far] in meters; near, {self.clip[0]:g}, is not below far, {self.clip[1]:g}"
             )
         if self.eye == self.lookat:
             raise ValueError("eye and lookat are the same point, so the camera has no direction: move one of them")

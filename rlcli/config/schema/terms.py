@@ -39,12 +39,13 @@ class _TermFunction:
 
 
 class TermConfig(StrictModel):
-    """A term: the function that it calls. The parameters of the function are further keys."""
+    """A term: `func` names its function; all other keys are parameters of this function."""
 
     model_config = ConfigDict(extra="allow")
 
     func: Annotated[str, _TermFunction()]
-    """Name of the function, searched in the task's own terms, then in rlcli.mdp. In Python also the function itself."""
+    """Name of the function or class, searched in the task's own terms, then in rlcli.mdp. A configuration in Python may
+    have the function itself."""
 
     @property
     def params(self) -> dict[str, Any]:
@@ -133,7 +134,7 @@ class ConstantNoiseConfig(_NoiseConfig):
 
 
 NoiseConfig = Annotated[UniformNoiseConfig | GaussianNoiseConfig | ConstantNoiseConfig, Field(discriminator="kind")]
-"""Noise of an observation: uniform, gaussian or constant, as `kind` says."""
+"""Noise of an observation; the key `kind` selects uniform, gaussian or constant noise."""
 
 
 class ScaleModifierConfig(StrictModel):
@@ -189,7 +190,7 @@ ModifierConfig = Annotated[
     | IntegratorModifierConfig,
     Field(discriminator="kind"),
 ]
-"""Modifier of an observation, such as a filter; `kind` says which."""
+"""Modifier of an observation, such as a filter; the key `kind` selects which one."""
 
 
 class DelayConfig(StrictModel):
@@ -312,6 +313,6 @@ class SuccessConfig(TermConfig):
 
 
 def bound_text(condition: Mapping[str, Any]) -> str:
-    """Return the bounds of a condition of success as text, such as `at most 0.1`; the empty text if it has none."""
+    """Return the bounds of a condition of success as text, such as `at most 0.1`; an empty text without bounds."""
     keys = ("at_least", "at_most")
     return " and ".join(f"{key.replace('_', ' ')} {condition[key]:g}" for key in keys if condition.get(key) is not None)

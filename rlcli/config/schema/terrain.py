@@ -68,7 +68,8 @@ class ObstaclesPatchConfig(PatchConfig):
     kind: Literal["obstacles"]
     """Kind of ground: always obstacles."""
     height: Range = (0.05, 0.2)
-    """Height of blocks and depth of pits [m], [at difficulty 0, at difficulty 1]; an obstacle has all or half of it."""
+    """Height of blocks and depth of pits [m], [at difficulty 0, at difficulty 1]; each obstacle has the
+    whole or half of this height."""
     width: Range = (0.25, 1.0)
     """[smallest, largest] edge length of an obstacle [m]."""
     count: Count = 40
@@ -137,7 +138,7 @@ SubTerrainConfig = Annotated[
     | GridPatchConfig,
     Field(discriminator="kind"),
 ]
-"""Kind of ground on a patch of a generated terrain; `kind` says which."""
+"""Ground on a patch of a generated terrain; the key `kind` selects flat, noise, stairs and so on."""
 
 
 class TerrainGeneratorConfig(StrictModel):
@@ -163,7 +164,8 @@ class TerrainGeneratorConfig(StrictModel):
     difficulty: ShareRange = (0.0, 1.0)
     """Difficulty of the first and of the last row, in [0, 1]."""
     curriculum: bool = True
-    """true: one kind of ground for each column, difficulty by row; false: both are drawn for each patch."""
+    """true: one kind of ground for each column, difficulty by row; false: kind and difficulty are drawn for each
+    patch."""
     max_start_level: Annotated[int, Field(ge=0)] | None = None
     """Highest level (row of the grid, from 0) at which environments start; each environment draws its level. null: the
     last level."""
@@ -194,4 +196,4 @@ class TerrainHeightsConfig(StrictModel):
 
 
 TerrainConfig = Annotated[TerrainGeneratorConfig | TerrainHeightsConfig, Field(discriminator="kind")]
-"""Terrain: generated, or heights from a file, as `kind` says."""
+"""Terrain; the key `kind` selects generated ground (generator) or heights from a file (heights)."""
