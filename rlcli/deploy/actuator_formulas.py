@@ -32,7 +32,10 @@ def actuator_models(env: VecEnv, terms: Iterable[BoundTerm], controls: list[dict
 
 
 def has_nominal_gains(model: ActuatorModel, env_id: int) -> bool:
-    """Return whether an environment has the gains and effort limits of the configuration, which the formula has."""
+    """Return whether gains and effort limits in environment `env_id` equal those of the configuration and the formula.
+
+    An event can have changed them.
+    """
     return all(
         torch.equal(getattr(model, key)[env_id].cpu(), torch.tensor(_nominal(model, key)))
         for key in ("stiffness", "damping", "effort_limit")

@@ -162,7 +162,7 @@ def verify(
 
 
 def _may_randomize(env: VecEnv) -> bool:
-    """Return whether gains or initial states may be random: in a direct task, or with events other than `reset_...`."""
+    """Return whether gains or start states may be random: in a direct task, or with events other than `reset_...`."""
     events = [event for event in env.config.events.values() if event is not None]
     return isinstance(env, DirectEnv) or not all(event.func.startswith("reset_") for event in events)
 
@@ -319,7 +319,12 @@ class _PlainMujocoRunner:
         self.disagreeing_steps += len(disagreeing)
 
     def terms(self, *, closed: bool) -> list[str]:
-        """Return the names of the terms that the generated program can compute (`closed`), or of the others."""
+        """Return names of terms, such as `observation joint_pos`.
+
+        Args:
+            closed: true: the terms that the generated program computes; false: the terms that only the task's code
+                computes.
+        """
         models = [
             {**m, "closed": m["closed"] and m["name"] not in self._random_gains} for m in self._plan["actuator_models"]
         ]

@@ -34,11 +34,14 @@ class ClosedLoopResult:
     scale: float
     """Mean absolute return of the evaluation's episodes, by which differences of returns are divided."""
     by_metadata: list[str]
-    """Terms that the generated program computed from formulas in the metadata."""
+    """Names of the terms that the generated program computed from formulas in the metadata."""
     by_task: list[str]
-    """Terms without a formula, and forces, which the task's own code computed from the states of plain MuJoCo."""
+    """Names of terms without a formula, and of forces; the task's code computed them for the states of plain MuJoCo."""
     synchronized_return: float | None = None
-    """Mean return with the environment's state set after every step; None: not needed, `plain_return` agrees."""
+    """Mean return with states re-synchronised after every step; None: not measured.
+
+    It is measured only if `plain_return` is too far from `evaluation_return` and all other checks pass.
+    """
     disagreeing_steps: int = 0
     """Re-synchronised steps after which the states of the two sides differed by more than rounding."""
 

@@ -77,7 +77,7 @@ class DeployedPolicy(nn.Module):
         return {"action": action, "command": command}
 
     def for_onnx(self) -> Self:
-        """Return a copy without ELU modules, which ONNX runtimes implement for float32 only."""
+        """Return a copy with a formula instead of each ELU module, because ONNX runtimes have ELU for float32 only."""
         graph = copy.deepcopy(self)
         for module in list(graph.modules()):
             for name, child in module.named_children():

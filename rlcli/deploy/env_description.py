@@ -1,6 +1,6 @@
 """Description of an environment for programs without rlcli: joints, actuators, formulas of observations and controls.
 
-It is stored in checkpoints and in exported files.
+Checkpoints and exported files contain the description.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -55,7 +55,7 @@ def describe(env: VecEnv) -> dict[str, Any]:
 
 
 def _describe_managed(env: ManagedEnv) -> tuple[dict[str, Any], list[BoundTerm]]:
-    """Describe the observations of a manager-based environment: (group -> observation terms), and its action terms."""
+    """Return the observation terms of a manager-based environment as JSON data, by group, and its action terms."""
     groups = {}
     for group in env.config.observations:
         begin, terms = 0, []
@@ -70,7 +70,7 @@ def _describe_managed(env: ManagedEnv) -> tuple[dict[str, Any], list[BoundTerm]]
 
 
 def _describe_direct(env: DirectEnv) -> tuple[dict[str, Any], list[BoundTerm]]:
-    """Describe the observations of a direct task: (group -> observations), and its actions as terms.
+    """Return the observations of a direct task as JSON data, by group, and its actions as terms.
 
     A direct task has formulas, and actions as terms, only if its method `in_terms` writes it as terms of `rlcli.mdp`.
     """

@@ -51,7 +51,7 @@ class Exported:
 
 
 def check_target(format_: str, output: Path | None) -> None:
-    """Check the options `--format` and `--output` of an export: the format exists, and the file has its suffix.
+    """Check the options `--format` and `--output`: the format exists, and the file has the suffix of the format.
 
     Raises:
         UsageError: for an unknown format, or a file with another suffix.

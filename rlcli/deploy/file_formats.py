@@ -59,6 +59,7 @@ def require_packages(format_: str) -> None:
 
     Raises:
         DependencyError: if one of these packages is not installed.
+        MachineError: if a limit such as `ulimit -v` leaves too little memory for onnxruntime.
     """
     if format_ != "onnx":
         return

@@ -57,7 +57,7 @@ def control_formula(env: VecEnv, term: BoundTerm, columns: tuple[int, int]) -> t
     Args:
         env: the environment.
         term: the action term.
-        columns: first column of the term in the policy's action, and the column after its last.
+        columns: first column of the term in the policy's action, and the column after the term's last column.
     """
     action = term.instance
     make = _ACTIONS.get(type(action).__name__) if _is_defined_in(actions, type(action)) else None

@@ -1,6 +1,6 @@
 """Metadata of an exported file: names, units and scales of its columns, and a description of the environment.
 
-A program needs them to run the policy. ONNX files also have the metadata that programs for mjlab read.
+A program that runs the policy reads this metadata. ONNX files also have the metadata that programs for mjlab read.
 """
 
 from collections.abc import Sequence
@@ -136,7 +136,7 @@ def terms_of_task_code(metadata: dict[str, Any]) -> list[str]:
 
 
 def _obstacle(model: dict[str, Any]) -> str:
-    """Return the reason for which an actuator model has no formula."""
+    """Return why an actuator model has no formula, as text for a message."""
     if model["kind"] == "own":
         return "a class of the task's code"
     return "its targets are delayed" if any(model["delay"]) else "the task's code sets its targets"
@@ -158,8 +158,12 @@ def _receiver(term: dict[str, Any], deployment: dict[str, Any] | None) -> str:
 def mjlab_properties(metadata: dict[str, Any], entity: str = "robot") -> dict[str, str]:
     """Return the metadata properties of mjlab 1.6's ONNX files, which programs for mjlab can read.
 
-    Items of a list are separated by commas, items of an inner list by semicolons. Properties that the checkpoint does
-    not have are left out, and lists of names if a name contains a separator.
+    Items of a list are separated by commas, items of an inner list by semicolons. A property is left out if the
+    metadata has no values for it, or if a name in its list contains a separator.
+
+    Args:
+        metadata: the metadata, as from `metadata_of`.
+        entity: the robot whose joints are listed; if the task has no entity of this name, the first entity with joints.
     """
     terms, actions = metadata["observations"], metadata["actions"]
     widths = [term["size"] // term["history"] for term in terms]

@@ -59,7 +59,7 @@ def read_numpy(file: Path) -> tuple[Any, str]:
 
 
 def literal(value: object) -> str:
-    """Return JSON-like data (dicts, lists, numbers, strings) as Python source code in ASCII."""
+    """Return data of JSON types (dicts, lists, numbers, strings, None) as Python source code in ASCII."""
     return pprint.pformat(value, width=110, sort_dicts=False).encode("ascii", "backslashreplace").decode()
 
 

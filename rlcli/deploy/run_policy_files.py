@@ -89,7 +89,7 @@ def generate_program(policy: Path, model: Path, format_: str, metadata: dict[str
 
 
 def check_overwrites(policy: Path) -> None:
-    """Check that --verify, which writes beside the file `policy`, does not overwrite it or a model of the user.
+    """Check that the files that --verify writes beside `policy` overwrite neither the policy nor a model of the user.
 
     Raises:
         UsageError: if the policy has the program's name, or the folder has a model that export did not write.
@@ -137,7 +137,14 @@ def write_program(folder: Path, text: str) -> bool:
 
 
 def write_model(spec: mujoco.MjSpec, model: mujoco.MjModel, folder: Path) -> Path:
-    """Write a model as XML if the XML describes all of it; else as a binary file for this version of MuJoCo.
+    """Write a model to a folder and return the path of the file.
+
+    The file is XML if XML can describe the whole model, else a binary file for this version of MuJoCo.
+
+    Args:
+        spec: the specification from which the model was compiled.
+        model: the model.
+        folder: the folder.
 
     Raises:
         MachineError: if the file cannot be written.
