@@ -1,6 +1,6 @@
 """Checks of `rlcli doctor`: whether this machine, this installation and every installed plugin work.
 
-`run_checks` runs them all; the other modules contain the checks, grouped by subject.
+`run_checks` runs all checks; the other modules contain the checks, grouped by subject.
 """
 
 import threading

@@ -29,8 +29,8 @@ _ANSWER_BYTES = 100_000
 _LATE = "no answer within"
 BUSY = "if the machine is busy: `rlcli doctor --probe-timeout 120`"
 REINSTALL = f"pip uninstall -y {' '.join(MUJOCO_PACKAGES)} && {pip_install('mujoco')}"
-"""Command that repairs MuJoCo. It uninstalls first: MuJoCo's three packages share files, so upgrading one removes files
-that another has just written."""
+"""Command that repairs MuJoCo. It first uninstalls all three packages of MuJoCo: they share files, so an upgrade of one
+package may remove files of another."""
 
 Answer = tuple[dict[str, Any] | None, str]
 """Answer of a check in a separate process: its result as JSON data and "", or None and the reason of the failure."""
@@ -48,11 +48,11 @@ def check_isolated(timeout_s: float) -> list[Check]:
 
 
 def compute_checks(answer: dict[str, Any] | None, reason: str) -> list[Check]:
-    """Return the checks whether torch and MuJoCo can be imported and compute, and keep all cores.
+    """Return the checks of torch and MuJoCo: both can be imported and compute, and do not reduce the number of cores.
 
     Args:
-        answer: result of the separate process; None: it failed.
-        reason: why it failed.
+        answer: result of the separate process; None: the process failed.
+        reason: why the process failed.
     """
     if answer is None:
         hint = REINSTALL if "mujoco" in reason.lower() else pip_install("--force-reinstall torch")
@@ -75,13 +75,13 @@ def compute_checks(answer: dict[str, Any] | None, reason: str) -> list[Check]:
 
 
 def gpu_checks(gpu: Answer | None) -> list[Check]:
-    """Return the checks whether the GPU's driver, torch and Warp fit together.
+    """Return the checks of the GPU: its driver, torch and Warp fit together.
 
     Args:
         gpu: answer of the separate process, see `isolated_checks._gpu`; None: there is no GPU driver.
     """
     if gpu is None:
-        return [Check("gpu", "ok", "no GPU; the CPU engine needs none")]
+        return [Check("gpu", "ok", "no GPU driver; the CPU engine needs no GPU")]
     answer, reason = gpu
     if answer is None:
         return [Check("gpu", "warning", f"a driver is installed, but its check failed: {reason}", "run nvidia-smi")]
@@ -98,7 +98,7 @@ def gpu_checks(gpu: Answer | None) -> list[Check]:
         text = f"a driver is installed, but torch finds no device{failure}"
         hint = "check whether nvidia-smi works; CUDA_VISIBLE_DEVICES hides devices"
     elif failure:
-        text += f"; torch cannot compute on it{failure}"
+        text += f"; torch cannot compute on this GPU{failure}"
         hint = "install a torch that is built for this GPU (https://pytorch.org)"
     elif warp_package is None or warp is None:
         text += f"; {'mujoco-warp' if warp_package is None else 'warp-lang'} is not installed"
@@ -123,7 +123,7 @@ def shared_memory_check(free: int) -> Check:
     if free >= LOW_SHARED_BYTES:
         return Check("shared memory", "ok", found, details=details)
     text = f"{found}: too little for several GPUs"
-    return Check("shared memory", "warning", text, "in a container, give it more: docker run --shm-size=8g", details)
+    return Check("shared memory", "warning", text, "in a container: docker run --shm-size=8g", details)
 
 
 def graphics_check(answers: dict[str, Answer]) -> Check:

@@ -43,7 +43,7 @@ def memory_check(free: int, limit: int | None) -> Check:
     found = f"{free / 1e9:.1f} GB free" + (f", this process may use {limit / 1e9:.1f} GB" if limit else "")
     if least >= LOW_MEMORY_BYTES:
         return Check("memory", "ok", found, details=details)
-    hint = "end other programs" if limit is None or free < limit else "raise that limit (container, `ulimit -v`)"
+    hint = "end other programs" if limit is None or free < limit else "raise the limit (container, `ulimit -v`)"
     return Check("memory", "warning", f"{found}: too little to train", f"{hint}, or set scene.num_envs lower", details)
 
 

@@ -38,7 +38,7 @@ def installation_checks() -> list[Check]:
 def metadata_checks() -> list[Check]:
     """Return one broken check for each distribution whose metadata cannot be read."""
     bad = unreadable_distributions()
-    hint = "reinstall that package, or delete the folder; it breaks other programs too"
+    hint = "reinstall this package, or delete the folder of its metadata, which may break other programs too"
     return [Check(f"metadata of {each.distribution}", "broken", each.reason, hint) for each in bad]
 
 
@@ -208,7 +208,8 @@ def _remedy(entry: Entry, reason: str) -> str:
     if entry.distribution == "rlcli":
         return pip_install("--force-reinstall --no-deps rlcli")
     late = "if the machine is busy: `rlcli doctor --probe-timeout 120`; else " if _is_late(reason) else ""
-    return f"{late}pip uninstall {entry.distribution}, or exclude it with RLCLI_PLUGINS; report it to its authors"
+    remove = f"pip uninstall {entry.distribution}, or exclude this plugin with RLCLI_PLUGINS"
+    return f"{late}{remove}; report the error to the plugin's authors"
 
 
 def _is_late(reason: str) -> bool:

@@ -84,7 +84,7 @@ def _driver() -> str | None:
 
 
 def _warp() -> dict[str, Any] | None:
-    """Return `version`, `devices` and `error` of Warp, which the GPU engine uses; None if it is not installed."""
+    """Return `version`, `devices` and `error` of Warp, which the GPU engine uses; None if Warp is not installed."""
     if version("warp-lang") is None:
         return None
     found: dict[str, Any] = {"version": version("warp-lang"), "devices": [], "error": ""}
@@ -102,7 +102,7 @@ def _warp() -> dict[str, Any] | None:
 def _render_image(backend: str) -> dict[str, Any]:
     """Check that an OpenGL backend can render an image without a window.
 
-    It uses MuJoCo alone, because rlcli's own renderer would take seconds to import.
+    The check uses only MuJoCo, because the import of rlcli's own renderer would take seconds.
     """
     if backend == "glfw" and not has_display():
         raise MachineError("there is no display; set DISPLAY, or use MUJOCO_GL=egl")

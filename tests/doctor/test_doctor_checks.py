@@ -228,7 +228,7 @@ def test_low_memory_gives_warnings():
     limited = memory_check(8 << 30, 512 << 20)
     assert (limited.state, "container" in limited.hint) == ("warning", True)
     assert memory_check(300 << 20, None).state == "warning"
-    assert shared_memory_check(64 << 20).hint == "in a container, give it more: docker run --shm-size=8g"
+    assert shared_memory_check(64 << 20).hint == "in a container: docker run --shm-size=8g"
     assert shared_memory_check(8 << 30).state == "ok"
 
 
