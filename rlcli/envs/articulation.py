@@ -21,9 +21,9 @@ from rlcli.sim.rotations import rotate_inverse
 class ArticulationView:
     """View of one entity (a robot or an object) in all environments, with getters and setters of tensors.
 
-    A direct task registers the view with `scene.add`; it can be used once the environment is built. Columns are the
-    hinge and slide joints of the entity, in the order of the model. The argument `indices` (n,) selects environments;
-    values then have one row for each index, else one row for each environment. Positions are in the world frame of each
+    A direct task registers the view with `scene.add` and can use it from `post_reset` on. Columns are the hinge and
+    slide joints of the entity, in the order of the model. The argument `indices` (n,) selects environments; values then
+    have one row for each index, else one row for each environment. Positions are in the world frame of each
     environment's own simulation. Unlike in OmniIsaacGymEnvs, setters may be called several times in a step, and getters
     return current values.
 
@@ -37,7 +37,7 @@ class ArticulationView:
         self.name = name or entity
 
     def bind(self, env: VecEnv) -> None:
-        """Connect the view to the simulation; the environment calls this.
+        """Connect the view to the simulation. The environment calls this method when it is built.
 
         Raises:
             TaskError: if the scene has no such entity.
@@ -200,7 +200,7 @@ class _Drive:
 
 
 def _make_drive(entity: Entity, kind: str) -> _Drive | None:
-    """Return an entity's actuators of a kind (motor, position, velocity); None if it has none.
+    """Return an entity's actuators of a kind (motor, position, velocity); None if it has no actuator of this kind.
 
     A gear multiplies forces and lengths: a joint's force is divided by the gear, a joint's target is multiplied by it.
     """

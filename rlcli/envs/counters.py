@@ -21,11 +21,11 @@ from rlcli.sim.env_selection import Field, Selection, in_place
 from rlcli.sim.saved_tensors import TensorState
 
 _MIN_STATES = 5
-"""Number of environments, with success and without, that `reward_gap` needs at least to compare their rewards."""
+"""`reward_gap` needs at least this number of environments with success, and as many without success."""
 
 
 class SuccessCondition:
-    """Condition of the task's section `success`: its value in the newest step, and for how many steps it has held."""
+    """Condition of the task's section `success`: its last value, and the number of steps for which it has held."""
 
     def __init__(self, term: BoundTerm, lengths: Tensor, as_field: Callable[[Tensor], Field], step_dt: float) -> None:
         config, first = term.config, first_value(term)
@@ -90,18 +90,18 @@ class EpisodeCounters(TensorState):
         """Rewards of the newest step. (num_envs,)"""
 
     def attach(self, engine: Engine) -> None:
-        """Make the attributes `*_field`: the engine's form of each tensor, a numpy array on the CPU for fast writes."""
+        """Create the attributes `*_field`: views of the tensors for fast writes, on the CPU numpy arrays."""
         self._as_field = engine.as_field
         self.id_field, self.length_field = engine.as_field(self.ids), engine.as_field(self.lengths)
         self.index_field = engine.as_field(self.indices)
         self._common_step = in_place(self.common_step)
 
     def set_success(self, terms: list[BoundTerm], step_dt: float) -> None:
-        """Make a `SuccessCondition` for each term of the task's section `success`."""
+        """Create a `SuccessCondition` for each term of the task's section `success`."""
         self.conditions = [SuccessCondition(term, self.lengths, self._as_field, step_dt) for term in terms]
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return the counters that are saved in a checkpoint."""
+        """Return the counters that a checkpoint contains, by name."""
         return {
             "episode_length": self.lengths,
             "episode_index": self.indices,
@@ -126,8 +126,9 @@ class EpisodeCounters(TensorState):
     def reward_gap(self) -> tuple[float, float] | None:
         """Return how much the newest rewards depend on success: (difference of means, its standard error).
 
-        The difference is the mean reward of environments where all conditions of success hold, minus the mean of the
-        others. None with fewer than five environments of either kind. New episodes do not count.
+        The difference is the mean reward of environments where all conditions of success hold, minus the mean reward of
+        the other environments. None with fewer than five environments of either kind. Environments at the start of an
+        episode do not count.
         """
         if not self.conditions:
             return None
@@ -153,7 +154,11 @@ class EpisodeCounters(TensorState):
         return {"success": success, "conditions": held, "condition_values": values}
 
     def end(self, terminated: Tensor, truncated: Tensor) -> tuple[Field, Field]:
-        """Count the episodes that end; return masks of them, and of those that end by time-out alone. (num_envs,)"""
+        """Increase the episode index where an episode ends.
+
+        Returns:
+            Where an episode ends, and where it ends by time-out alone. (num_envs,) bool each
+        """
         failed, late = self._as_field(terminated), self._as_field(truncated)
         finished = failed | late
         # must come before the selection is made: its random numbers depend on this counter

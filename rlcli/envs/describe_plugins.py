@@ -20,7 +20,7 @@ from rlcli.trainers import TrainerSpec
 
 
 def describe(name: str) -> Details:
-    """Load a task, build an environment of it, and return the task's description.
+    """Load a task, build one environment of the task, and return the task's description.
 
     Raises:
         RlcliError: if the environment cannot be built.

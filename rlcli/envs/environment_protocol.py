@@ -93,7 +93,7 @@ class Environment(Protocol):
         """
 
     def compute_success(self) -> Tensor | None:
-        """Return where all conditions of success hold in the current state; None without one. (num_envs,) bool"""
+        """Return where all conditions of success hold in the current state; None without conditions. (num_envs,)"""
 
     def check(self) -> None:
         """Raise the pending `DivergedError` of the steps since the last call. On a CPU `step` has already raised it."""
@@ -169,7 +169,7 @@ class Environment(Protocol):
         return self._playing
 
     def pause(self, paused: bool = True) -> None:
-        """Pause, or continue with `paused=False`."""
+        """Pause the environment, so that `step` raises an error; with `paused=False`, end the pause."""
         self._playing = not paused
 
     def close(self) -> None:

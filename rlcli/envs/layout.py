@@ -17,7 +17,9 @@ class TermLayout:
     name: str
     size: int
     elements: tuple[str, ...] = ()
+    """Name of each column, such as a joint; empty: the columns have no names."""
     unit: str = ""
+    """Unit of the values; empty: unknown or none."""
     scale: tuple[float, ...] | None = None
     """Factor of each column; None: no scale, or the task's own code scales the action."""
     clip: tuple[float, float] | tuple[tuple[float, float], ...] | None = None

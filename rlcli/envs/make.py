@@ -29,13 +29,13 @@ def make_env(
     shared_streams: int = 0,
     shard: Shard | None = None,
 ) -> VecEnv:
-    """Return the environment of a task: a `ManagedEnv`, a `DirectEnv`, or the class of the task's format.
+    """Build and return the environment of a task: a `ManagedEnv`, a `DirectEnv`, or the class of the task's format.
 
     Args:
         task: a resolved task, or a `TaskConfig` built in Python.
         seed: seed of all random numbers.
         device: device of the engine and of all tensors.
-        root: folder of the models of a `TaskConfig`; by default the working directory.
+        root: folder of the models of a `TaskConfig`; None: the current folder.
         shared_streams: see `VecEnv`.
         shard: see `VecEnv`.
     """

@@ -78,7 +78,7 @@ class ManagedEnv(VecEnv):
                 prepare(scene.spec, config.params)
 
     task_log: TaskLog | None = None
-    """Values that the code of a task of another framework logs; the plugin of the framework sets it."""
+    """Log of a task of another framework, which the plugin of the framework sets; None for other tasks."""
     command_manager: CommandManager
     action_manager: ActionManager
     event_manager: EventManager
@@ -254,7 +254,7 @@ class ManagedEnv(VecEnv):
         return selection
 
     def _select_by_step(self, mask: Field) -> Selection | None:
-        """Return the environments where `mask`, (num_envs,), is true; None if there are none.
+        """Return a selection of the environments where `mask`, (num_envs,), is true; None if there is none.
 
         The random numbers of this selection depend on the current step, so each step draws new ones.
         """
@@ -303,11 +303,11 @@ class ManagedEnv(VecEnv):
         return {**parts, **{"term." + ".".join(map(str, term.path)): term for term in self._terms()}}
 
     def markers(self) -> list[Marker]:
-        """Return the markers of the commands."""
+        """Return the markers of the commands: shapes, such as arrows, that viewers show."""
         return self.command_manager.markers()
 
     def unsaved_state(self) -> list[str]:
-        """Return the names of attributes that cannot be saved, of terms that are classes."""
+        """Return the names of the attributes of terms (of classes only) that a checkpoint cannot contain."""
         memories = [term.memory for term in self._terms() if term.memory]
         return [attribute for memory in memories for attribute in memory.unsaved()]
 

@@ -2,8 +2,8 @@
 
 The map of the action follows from the geometry of the entities (`rlcli.scene.entity_mirror`). Then environments in
 random states and their mirror images take the same steps on the CPU engine, with mirrored actions. Their motions and
-rewards must stay mirror images of each other. The map of the observations follows from the observations of both: the
-mirror image of each column must equal that column or another one of the same term, or its negative.
+rewards must stay mirror images of each other. The map of the observations follows from a comparison of the two: each
+column of the mirrored observation must equal one column of the same term, or the negative of one.
 """
 
 from __future__ import annotations
@@ -161,7 +161,7 @@ class _MirrorTest:
                 if other not in elements:
                     raise TaskError(
                         f"action '{term.name}' drives joint '{element}', but not its mirror image '{other}'; add"
-                        " that joint"
+                        f" '{other}'"
                     )
                 index.append(start + elements.index(other))
                 sign.append(own)

@@ -29,7 +29,9 @@ class StepObserver:
         """Run on the state from which rewards and terminations are computed, before any reset."""
 
     def on_divergence(self, found: list[Divergence], pending: bool) -> None:
-        """Run when simulations have diverged, before a reset deletes the recorded engine calls.
+        """Run when simulations have diverged, or when an event or a reset wrote values that are out of bounds.
+
+        The method runs before a reset deletes the recorded engine calls.
 
         Args:
             found: environment and cause of the first few divergences (`rlcli.sim.divergence_report.Divergence`).
@@ -55,7 +57,7 @@ class Observers:
         self._set(())
 
     def add(self, observer: StepObserver) -> None:
-        """Add an observer."""
+        """Add an observer; the following steps call its methods after those of earlier observers."""
         self._set((*self._observers, observer))
 
     def remove(self, observer: StepObserver) -> None:

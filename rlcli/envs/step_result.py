@@ -29,7 +29,7 @@ class Episodes:
     truncated: Tensor
     """Whether the episode ended by time-out alone. (n,) bool"""
     success: Tensor | None
-    """Whether the episode met the task's conditions of success; None for a task without one. (n,) bool"""
+    """Whether the episode met the task's conditions of success; None for a task without conditions. (n,) bool"""
     conditions: dict[str, Tensor] = field(default_factory=dict)
     """Condition of success -> whether it held during the last `hold_s` seconds. (n,) bool each"""
     condition_values: dict[str, Tensor] = field(default_factory=dict)
@@ -64,7 +64,10 @@ class StepResult:
     """
 
     obs: dict[str, Tensor]
-    """Group -> observations after resets: where an episode ended, the first ones of the next. (num_envs, d) float32"""
+    """Group -> observations after resets. (num_envs, d) float32
+
+    Where an episode ended, the row has the first observation of the next episode.
+    """
     reward: Tensor
     """Reward of the step. (num_envs,) float32"""
     terminated: Tensor
@@ -93,4 +96,4 @@ class StepRecord:
     reward_terms: Tensor
     """Weighted value of each term of `reward_names`. (terms, num_envs) float32"""
     episodes: Episodes | None
-    """Episodes that end; None if none does."""
+    """Episodes that end in this step; None if no episode ends."""

@@ -71,7 +71,7 @@ class VecEnv(Workflow):
         self.seconds = {"physics": 0.0, "step": 0.0}
         self.observers = Observers()
         self.physics_override: Callable[[], None] | None = None
-        """Function that replaces the engine's physics step: it writes states and derived fields; None: none."""
+        """Function that replaces the engine's physics step and writes states and derived fields; None: the engine."""
         self._last_obs: dict[str, Tensor] = {}
         self._read_finals: Field = torch.zeros(self.num_envs, dtype=torch.bool)  # where `final_obs` is valid
         self._counters = EpisodeCounters(self.shard, self.device)
@@ -208,7 +208,7 @@ class VecEnv(Workflow):
     def _end_episodes(
         self, terminated: Tensor, truncated: Tensor
     ) -> tuple[Selection | None, dict[str, Tensor] | None, Episodes | None]:
-        """End the episodes that are terminated or truncated; return None three times if none ends.
+        """End the episodes that are terminated or truncated; return (None, None, None) if no episode ends.
 
         Returns:
             Selection of the environments whose episode ends; last observations by group, (num_envs, d) each, or None
@@ -297,13 +297,13 @@ class VecEnv(Workflow):
     def success_reward_gap(self) -> tuple[float, float] | None:
         """Return how much the newest rewards depend on success: (difference of means, its standard error).
 
-        The difference is the mean reward of environments where all conditions of success hold, minus the mean of the
-        others. None if too few environments are in either group.
+        The difference is the mean reward of environments where all conditions of success hold, minus the mean reward of
+        the other environments. None if too few environments are in either group.
         """
         return self._counters.reward_gap()
 
     def compute_success(self) -> Tensor | None:
-        """Return where all conditions of success hold in the current state; None without one. (num_envs,) bool"""
+        """Return where all conditions of success hold in the current state; None without conditions. (num_envs,)"""
         held = [condition.holds_for_tensors() for condition in self._counters.conditions]
         return functools.reduce(torch.logical_and, held) if held else None
 
@@ -341,7 +341,7 @@ class VecEnv(Workflow):
         self.engine.close()
 
     def world(self, env: int = 0) -> tuple[mujoco.MjModel, mujoco.MjData]:
-        """Return one environment as MuJoCo's own structures."""
+        """Return the model and the state of one environment as an MjModel and an MjData."""
         return self.engine.world(env)
 
     def state_dict(self) -> dict[str, Tensor]:

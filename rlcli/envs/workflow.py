@@ -92,7 +92,11 @@ class Workflow(Environment):
         """Prepare for a reset of all environments."""
 
     def _raise_for_term(self, what: str) -> None:
-        """Raise a `DivergedError` that names the term which made `what` (such as the reward) not finite, if known."""
+        """Raise a `DivergedError` that names the term with the value that is not finite; return if it is unknown.
+
+        Args:
+            what: the quantity that is not finite, such as `the reward`.
+        """
 
     def _restore_observations(self) -> dict[str, Tensor]:
         """Return the observations of a state that has just been loaded."""
@@ -138,5 +142,5 @@ class Workflow(Environment):
         return []
 
     def markers(self) -> list[Marker]:
-        """Return the shapes that viewers show beside the bodies. Viewers call it; a step does not."""
+        """Return the shapes that viewers show beside the bodies. Only viewers call this method."""
         return []

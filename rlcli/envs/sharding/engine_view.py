@@ -128,7 +128,7 @@ class ShardedEngine:
 
 
 def sums(counts: Sequence[Mapping[str, N]]) -> dict[str, N]:
-    """Add up the counts of all shards, name by name."""
+    """Return the sum of the counts of all shards for each name, in one mapping."""
     names = dict.fromkeys(name for count in counts for name in count)
     return {name: sum(count.get(name, 0) for count in counts) for name in names}
 

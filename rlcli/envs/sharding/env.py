@@ -44,7 +44,7 @@ from rlcli.sim.saved_tensors import mean_of, means
 
 
 class ShardedEnv(Environment):
-    """Environments of a task in shards: this process steps the first one, and each worker process another.
+    """Environments of a task in shards: this process steps the first shard, and each worker process another one.
 
     All results are bit-identical to those of one process. `local` has the entities, managers and terms of the first
     shard.
@@ -161,7 +161,7 @@ class ShardedEnv(Environment):
         return len(self._shards)
 
     def compute_success(self) -> Tensor | None:
-        """Return where all conditions of success hold in the current state; None without one. (num_envs,) bool"""
+        """Return where all conditions of success hold in the current state; None without conditions. (num_envs,)"""
         parts = self.call_all(_success)
         return None if parts[0] is None else torch.cat(parts)
 
@@ -169,7 +169,7 @@ class ShardedEnv(Environment):
         """Do nothing: a CPU raises errors in the step."""
 
     def extras(self) -> dict[str, float]:
-        """Return values to log, by metric: means of the task's `extras` or curriculum, and new divergences by cause."""
+        """Return the values to log, by the names of the metrics; see `Environment.extras`."""
         return {**means(self._metric_values()), **sums(self.call_all(_divergence_metrics))}
 
     def step_metrics(self) -> dict[str, Tensor]:
@@ -223,7 +223,7 @@ class ShardedEnv(Environment):
         return self.local.stateful_objects()
 
     def unsaved_state(self) -> list[str]:
-        """Return the state that `state_dict` cannot contain."""
+        """Return the names of attributes that `state_dict` cannot save."""
         return self.local.unsaved_state()
 
     def episode_dependencies(self) -> list[str]:
@@ -309,7 +309,7 @@ class ShardedEnv(Environment):
 
     def _require_usable(self) -> None:
         if self._is_broken and not self._stage:
-            raise RuntimeError("a step was interrupted, and the environment cannot be used any more; create a new one")
+            raise RuntimeError("a step was interrupted, so the environment cannot be used any more; create a new one")
 
     def _reach(self, stage: Stage, content: Any) -> None:
         """Wait until all shards reach the stage of the first shard; run the observers of this and of earlier stages."""
@@ -369,9 +369,8 @@ class ShardedEnv(Environment):
     def _joined_metric(self, parts: Sequence[Tensor]) -> Tensor:
         """Return the values of a metric for all environments, joined from the shards.
 
-        If each shard has a single value instead of one for each environment, return the weighted mean of these values.
-
-        The weights are the numbers of environments.
+        If each shard has a single value instead of one for each environment, return the mean of these values, weighted
+        by the numbers of environments.
         """
         if parts[0].dim():
             return join(parts)

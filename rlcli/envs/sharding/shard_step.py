@@ -28,7 +28,7 @@ SLOTS = 3
 _FIXED_COLUMNS = 4
 """Number of values that every finished episode has: environment, return, length, truncated."""
 _MAX_COLUMNS = 256
-"""Number of values that a finished episode may have at most, without its reward terms."""
+"""Largest number of values of a finished episode, without its reward terms."""
 
 
 class Stage(enum.IntEnum):
@@ -88,7 +88,7 @@ class Columns:
 def counter_specs(total: int) -> dict[str, ArraySpec]:
     """Return the shape and type of the episode counters of all environments: lengths and indices, (2, total).
 
-    They are separate from `array_specs`, because they are needed before the environments are built.
+    `array_specs` needs a built environment, but the counters are needed before the environments are built.
     """
     return {"counters": ArraySpec((2, total), torch.int64)}
 
@@ -126,7 +126,7 @@ class ShardRunner:
         number: index of the shard.
         arrays: the shared tensors.
         stop: called as `stop(stage, data)` at each stage that an observer of the main process needs, and at the end;
-            `data` is for these observers. It returns when the shard may continue.
+            `data` is for these observers. The call returns when the shard may continue.
         check: called before the end of each step and reset, to raise an error that makes the results invalid.
     """
 

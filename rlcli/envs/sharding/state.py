@@ -1,6 +1,6 @@
-"""Functions that join the saved states of shards into the state of one environment, and split such a state again.
+"""Functions that join the saved states of shards (parts of the environments) into one state, and split it again.
 
-So a checkpoint does not depend on the number of processes.
+With them, a checkpoint does not depend on the number of processes.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def environment_dim(shapes: Sequence[torch.Size]) -> int | None:
 def join(parts: Sequence[Tensor]) -> Tensor:
     """Concatenate the tensors of all shards along the environment dimension.
 
-    If they have no such dimension, return the first shard's tensor.
+    If the tensors have no such dimension, return the first shard's tensor.
     """
     dim = environment_dim([part.shape for part in parts])
     return parts[0] if dim is None else torch.cat(list(parts), dim=dim)
@@ -75,8 +75,8 @@ def split_state(
 
 
 def _first_dim(value: Tensor, total: int) -> int | None:
-    """Return the environment dimension of a tensor that the current state does not have, by a guess.
+    """Guess the environment dimension of a tensor that the current state does not have.
 
-    It is 0 if the tensor has `total` rows, one for each environment; else None.
+    Return 0 if the tensor has `total` rows, one for each environment; else None.
     """
     return 0 if value.shape[:1] == (total,) else None

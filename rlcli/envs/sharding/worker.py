@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 BUILD, MAP, SHARE, STEP, RESET, LOAD, CALL, CONTINUE = b"b", b"m", b"h", b"s", b"r", b"l", b"c", b"g"
 """Kinds of the messages that the main process sends: build the shard; map the shared tensors of the steps; add other
-shared tensors; step; reset; load a state; call a method; continue after a stage."""
+shared tensors; step; reset; load a state; call a function; continue after a stage."""
 READY, STOPPED, VALUE, ERROR, WARNING = b"y", b"t", b"v", b"e", b"w"
 """Kinds of the messages that a worker sends: its shard is built; it stopped at a stage; value of a call; an error; a
 warning, which may come at any time."""

@@ -14,9 +14,9 @@ from rlcli.machine.cores import available_cores
 from rlcli.machine.memory import available_memory
 
 ENVS_PER_WORKER = 512
-"""Smallest number of environments per process with `scene.workers: auto`: below it more processes are not faster."""
+"""Smallest number of environments for each process with `scene.workers: auto`: smaller parts are not faster."""
 FEWEST_WORKERS = 4
-"""`scene.workers: auto` uses one process or at least this number: two or three are not faster than one."""
+"""`scene.workers: auto` uses one process, or at least this number: two or three processes are not faster than one."""
 
 FREE_MEMORY_PER_WORKER = 1 << 30
 """Free memory for each process that `auto` starts [bytes]; a process takes about a quarter of it."""

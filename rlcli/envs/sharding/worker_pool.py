@@ -43,7 +43,7 @@ class Worker:
     """One worker process.
 
     Args:
-        number: index of its shard.
+        number: index of the shard that the worker steps.
         arrays: descriptor of the file of the shared tensors.
     """
 
@@ -103,7 +103,7 @@ class Worker:
         return self._process.poll() is not None
 
     def disconnect(self) -> None:
-        """Close the connection; the process then ends, also if it was stopped."""
+        """Close the connection, so that the process ends; continue a process that a signal has stopped."""
         self._channel.close()
         if os.name == "posix" and not self.has_ended():
             self._process.send_signal(signal.SIGCONT)
@@ -147,7 +147,7 @@ class Workers:
     """All worker processes of an environment; they end when this object is closed or deleted.
 
     Args:
-        count: number of processes; each starts now and imports its modules before `build` sends its job.
+        count: number of processes; the constructor starts them, and they import their modules before `build` is called.
 
     Raises:
         MachineError: if a limit such as `ulimit -v` leaves no room for torch.
@@ -207,13 +207,16 @@ _early: list[Workers] = []
 
 
 def start_early(count: int) -> None:
-    """Start workers for the next environment, before this process imports torch: all then import at the same time."""
+    """Start `count` workers for the next environment.
+
+    Call this function before torch is imported, so that this process and the workers import at the same time.
+    """
     if count:
         _early.append(Workers(count))
 
 
 def take_workers(count: int) -> Workers:
-    """Return `count` worker processes: those of `start_early` if it started this number, else new ones."""
+    """Return `count` worker processes: those that `start_early` started if their number fits, else new processes."""
     if _early and len(_early[-1]) == count:
         return _early.pop()
     close_early()
