@@ -1,1 +1,1 @@
-"""Evaluation of policies: statistics of episodes, limits, comparisons, stress tests, a reference controller (LQR)."""
+"""Evaluation of policies: statistics of episodes, limits, comparisons, stress tests, and LQR as a reference policy."""

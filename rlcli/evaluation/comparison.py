@@ -46,7 +46,8 @@ class Comparison:
     pairs: list[dict[str, Any]]
     """One entry for each policy but the first: metric -> statistics of the pair (first policy, this policy).
 
-    They are the mean of first - this over equal episodes, and the probability that the first is better.
+    The statistics are the mean difference (first - this policy) over the same episodes, and the probability that the
+    first policy has the higher value in a random episode.
     """
     num_envs: int
 
@@ -108,7 +109,7 @@ def find_policies(names: Sequence[str], request: PolicyRequest) -> list[PolicyIn
 
 
 def compare(names: Sequence[str], policies: Sequence[PolicyInTask], episodes: int) -> Comparison:
-    """Evaluate the policies in the same episodes, and compare each with the first.
+    """Evaluate the policies in the same episodes, and compare the first policy with each other one.
 
     Args:
         names: the names of the policies that were given to `find_policies`.
@@ -174,7 +175,7 @@ def _settings(resolved: Resolved) -> dict[str, Any]:
 
 
 def _compare_pair(left: Evaluation, right: Evaluation) -> dict[str, Any]:
-    """Compare two evaluations metric by metric: difference (left - right), and probability that `left` is better.
+    """Compare two evaluations metric by metric: difference (left - right), and probability that `left` is higher.
 
     Episode i of both evaluations must have the same random numbers.
     """

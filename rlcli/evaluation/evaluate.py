@@ -29,7 +29,7 @@ _COLUMNS = (
 
 @dataclass(slots=True)
 class Evaluation:
-    """Result of an evaluation. Each list has one value for each episode, in the order in which the episodes ended."""
+    """Result of an evaluation. Each list has one value for each episode, in the order of the episodes' ends."""
 
     conditions: dict[str, dict[str, Any]] = field(default_factory=dict)
     """Condition of success -> its bounds, as `at_least` and `at_most`."""
@@ -123,7 +123,7 @@ def evaluate(
         act: the policy, a function from observations (num_envs, d) to actions (num_envs, a).
         episodes: number of episodes in each group.
         on_step: called with the result of every step.
-        groups: number of equal, consecutive parts of the environments; `Evaluation.part` returns the result of one.
+        groups: number of equal, consecutive parts of the environments, for `Evaluation.part`.
 
     Raises:
         ConfigError: if an episode does not end because the task has no time-out.

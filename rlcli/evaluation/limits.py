@@ -68,7 +68,8 @@ class Limit:
         value = self.value_in(summary)
         if value is None:
             return (
-                f"{self.key} is unknown: it needs two or more episodes with finite values; the limit is {self.value:g}"
+                f"{self.key} is unknown, because there are fewer than two episodes or values that are not finite;"
+                f" the limit is {self.value:g}"
             )
         if self.is_minimum and value < self.value:
             return f"{self.key} is {value:.6g}, below {self.value:g}"
@@ -116,7 +117,7 @@ def require_success(resolved: Resolved, keys: Iterable[str], instead: str = "--f
         UsageError: if a metric is `success` and the task does not define success.
     """
     if any(key.partition(".")[0] == "success" for key in keys) and not resolved.task.success:
-        hint = f"add `success:` to its YAML, or write {instead}"
+        hint = f"add `success:` to the task's YAML, or write {instead}"
         raise UsageError("the task defines no condition of success, so it has no success rate", hint=hint)
 
 
@@ -148,7 +149,7 @@ def _parse(text: str, is_minimum: bool) -> Limit:
 
 
 def _is_key(limit: Limit) -> bool:
-    """Return whether the key of a limit is well-formed; whether the metric exists is known after an evaluation."""
+    """Return whether the key of a limit is well-formed. Whether its metric exists is known only after an evaluation."""
     head, _, rest = limit.key.partition(".")
     if head in _KEYS:
         return rest in ("", limit.end)

@@ -2,7 +2,7 @@
 
 The linear model is identified from the environment: one step from each of many states near the default one, with small
 actions. The regulator uses the policy's observations and actions. A task has no regulator if its default state is not
-an equilibrium, if the observations do not determine the state, or if no linear feedback stabilises it.
+an equilibrium, if the observations do not determine the state, or if no linear feedback stabilizes the default state.
 """
 
 import contextlib
@@ -32,7 +32,7 @@ _SINGULAR = 1e-4
 """Fraction of the largest singular value of the observations below which a singular value is a rounding error."""
 _MAX_ITERATIONS = 100_000
 _MAX_COST = 1e12
-"""Largest cost of a state of length 1; with a higher cost, no linear feedback stabilises the system."""
+"""Largest cost of a state of length 1; with a higher cost, the system counts as one that no feedback stabilizes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +105,7 @@ def regulator(resolved: Resolved, bound: float | None) -> Regulator:
 
 
 def riccati(a: Matrix, b: Matrix, q: Matrix, r: Matrix) -> Matrix | None:
-    """Return the gain k of the feedback u = -k x that minimises the sum of x'qx + u'ru, or None if none exists.
+    """Return the gain k of the feedback u = -k x that minimizes the sum of x'qx + u'ru; None if there is no such gain.
 
     x is the state, u the input, and the next state is a x + b u.
 

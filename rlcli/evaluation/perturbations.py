@@ -184,7 +184,7 @@ class _Push:
         found = match(sweep.element, names, "entity or joint")
         if len(found) != 1:
             raise NameProblem(
-                f"the pattern matches several names: {listing(names[i] for i in found)}", "name one of them"
+                f"the pattern matches several names: {listing(names[i] for i in found)}", "write one of these names"
             )
         name = names[found[0]]
         self._root, self._joint = floating.get(name), joints.get(name)
@@ -258,7 +258,7 @@ class ModelPerturbation:
     Args:
         env: the environment.
         sweep: the parameter.
-        values: its value in each environment; NaN: not changed. (num_envs,) float64
+        values: value of the parameter in each environment; NaN: not changed. (num_envs,) float64
 
     Raises:
         NameProblem: if the model lacks the parameter or an element, or if the values would change nothing.

@@ -52,7 +52,7 @@ class PolicyRequest:
     min_envs: int = 1
     """Smallest number of environments."""
     usual_envs: int | None = None
-    """Number of environments if neither the user nor the task's `play:` sets it; None: as in the training."""
+    """Largest number of environments if neither the user nor the task's `play:` sets a number; None: no limit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +61,7 @@ class PolicyInTask:
 
     resolved: Resolved
     run: Run | None
-    """The run of the checkpoint; None for a policy without one."""
+    """The run of the checkpoint; None for a policy that belongs to no run."""
     checkpoint: Path | None
     reason: str | None
     """Why this checkpoint was chosen."""
@@ -146,7 +146,7 @@ def split_overrides(task: str | None, overrides: Sequence[str]) -> tuple[str | N
 
 
 def named_task_or_run(task: str, runs_dir: Path | None) -> TaskSource:
-    """Return the task that the user has named. If a run has this name (a common mistake), the error says so.
+    """Return the task that the user has named. If a run has this name (a common mistake), the error names the run.
 
     Args:
         task: name, file or folder of a task.
@@ -272,7 +272,7 @@ def check_record(record: Path | None, mode: str) -> None:
 
     Raises:
         UsageError: for an unknown mode, or if the path is a folder, pipe or device.
-        MachineError: if the folder of the file does not exist or takes no files.
+        MachineError: if the folder of the file does not exist or cannot be written.
     """
     modes = ("all", "succeeded", "failed", "separate")
     require_known(mode, modes, "--record-mode", "modes")
@@ -282,7 +282,7 @@ def check_record(record: Path | None, mode: str) -> None:
     for file in files:
         require_regular(file)
     if not record.absolute().parent.is_dir():
-        raise MachineError(f"--record: there is no folder {record.absolute().parent}; create it")
+        raise MachineError(f"--record: there is no folder {record.absolute().parent}; create this folder")
     for file in files:
         require_writable(file)
 

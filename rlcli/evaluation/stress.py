@@ -122,7 +122,7 @@ def stress(
         policy: the policy.
         sweeps: the parameters that are varied, with their values.
         episodes: number of episodes in each variant.
-        worst: number of random variants, in which a worse one is searched.
+        worst: number of random variants that are evaluated to find a worse one; 0: none.
         reference: a policy that is evaluated in the same variants.
 
     Raises:
@@ -193,7 +193,7 @@ def run_points(
 def search(sweeps: Sequence[Sweep], center: Point, count: int, seed: int) -> list[Point]:
     """Return at most `count` different random points between the lowest and highest values of the sweeps.
 
-    Half of them are near the point `center`, the others are uniformly distributed.
+    Half of the points are near the point `center`, the others are uniformly distributed.
     """
     generator = np.random.default_rng(derive(seed, "stress"))
     middle = np.array([sweep.share(value) for sweep, value in zip(sweeps, center, strict=True)])
@@ -203,5 +203,8 @@ def search(sweeps: Sequence[Sweep], center: Point, count: int, seed: int) -> lis
 
 
 def score(summary: Summary) -> tuple[float, float]:
-    """Return the sort key of a variant, (success rate, mean return), from its summary; the worst comes first."""
+    """Return the sort key of a variant, (success rate, mean return), from its summary; the worst variant comes first.
+
+    Without conditions of success the success rate counts as 0.
+    """
     return summary["success"]["rate"] if "success" in summary else 0.0, summary["return"]["mean"]

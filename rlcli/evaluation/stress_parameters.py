@@ -193,5 +193,5 @@ def _values(text: str, written: str, name: str, points: int, absolute: bool) -> 
 def _number(text: str, part: str) -> float:
     value = float_or_nan(part)
     if not math.isfinite(value):
-        raise UsageError(f"--sweep {text}: '{part.strip()}' is not a number; write one, as in 0.5")
+        raise UsageError(f"--sweep {text}: '{part.strip()}' is not a number; write a number, as in 0.5")
     return value

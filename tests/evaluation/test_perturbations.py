@@ -308,7 +308,7 @@ def test_floating_entity_is_pushed_horizontally(world):
         ("action_delay.trun=0:1", "no action matches 'trun'", "did you mean 'turn'"),
         ("push=0:1", "no entity has a floating base", "push.NAME"),
         ("push.hing=0:1", "matches 'hing'", "hinge"),
-        ("push..*=0:1", "matches several names", "name one of them"),
+        ("push..*=0:1", "matches several names", "write one of these names"),
     ],
 )
 def test_invalid_perturbation_is_refused_with_a_hint(world, text, output, hint):
