@@ -1,1 +1,1 @@
-"""Resources of the machine that this process may use, and settings of its process and libraries."""
+"""Cores, memory, devices and files of the machine that this process may use, and settings of the process."""

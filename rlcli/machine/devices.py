@@ -53,6 +53,6 @@ def choose_device(wanted: str) -> str:
 
 
 def has_gpu_driver() -> bool:
-    """Return whether an NVIDIA driver is installed (in WSL: that of Windows), without importing torch."""
+    """Return whether an NVIDIA driver is installed (in WSL: the driver of Windows), without importing torch."""
     files = ("/proc/driver/nvidia", "/dev/nvidiactl", "/dev/dxg")
     return shutil.which("nvidia-smi") is not None or any(Path(file).exists() for file in files)

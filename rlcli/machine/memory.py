@@ -108,7 +108,7 @@ def resident_memory(report: Path = Path("/proc/self/statm")) -> int | None:
 
 
 def memory_error(error: BaseException | None) -> MachineError | None:
-    """Return the error to show if an exception, or one of its causes, means that memory was too small; else None."""
+    """Return the error to show if an exception, or one of its causes, means too little memory; else None."""
     limit = address_space()
     limited = f" (the process is limited to {limit >> 20} MiB)" if limit else ""
     while error is not None:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 @contextlib.contextmanager
 def descriptor_redirected(descriptor: int, target: int | None = None) -> Iterator[None]:
-    """Redirect what C code writes to a file descriptor in the `with` block; without effect if it is closed.
+    """Redirect what C code writes to a file descriptor in the `with` block; a closed descriptor stays closed.
 
     Args:
         descriptor: the file descriptor: 1 is stdout, 2 is stderr.

@@ -8,7 +8,7 @@ from rlcli.safe_text import read_number
 
 
 def python_command(*arguments: str) -> list[str]:
-    """Return the command that starts this Python with arguments, so that it imports nothing from the current folder."""
+    """Return the command that starts this Python with arguments. It cannot import files of the current folder."""
     return [sys.executable, "-P", *arguments]
 
 
@@ -29,6 +29,7 @@ def launcher_number(name: str, default: int, least: int = 0) -> int:
 def limit_openmp_spinning() -> None:
     """Let OpenMP threads spin only briefly while they wait, unless the user set GOMP_SPINCOUNT.
 
-    Call it before torch is imported. On a busy machine libgomp's long spinning makes an update ten times slower.
+    Call this function before torch is imported. On a busy machine libgomp's long spinning makes the update of a policy
+    ten times slower.
     """
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")

@@ -10,7 +10,8 @@ from pathlib import Path
 def processor(info: Path = Path("/proc/cpuinfo")) -> dict[str, str]:
     """Return the processor's `model`, its vector instruction sets (`kernels`) and a hash of all its `flags`.
 
-    Math libraries choose their kernels by these, so results may differ in the last bits between two processors.
+    Math libraries choose their kernels by the instruction sets, so results may differ in the last bits between two
+    processors.
     """
     entries: dict[str, str] = {}
     with contextlib.suppress(OSError), info.open(encoding="utf-8", errors="replace") as lines:
