@@ -28,7 +28,7 @@ _LIBRARIES = ("builtins.", "rlcli.", "torch.", "numpy.", "mujoco.")
 
 
 class NotSerializableError(TypeError):
-    """A value that cannot be written as JSON."""
+    """Error for a value that JSON cannot contain."""
 
 
 class AttributeState:
@@ -154,7 +154,7 @@ class AttributeState:
             return
         if not (current is None or isinstance(current, Tensor | np.ndarray)):
             raise ValueError(
-                f"the saved value '{path}' is a tensor, but class {type(self._owner).__name__} has another value there;"
+                f"the saved value '{path}' is a tensor, but class {type(self._owner).__name__} has no tensor there;"
                 " restore the old code of the class"
             )
         if isinstance(container, dict):

@@ -61,10 +61,15 @@ class Knob:
     name: str
     """Name of the knob: `ELEMENT`, or `TERM.ELEMENT` if several terms have an element of this name."""
     term: str
+    """Name of the command term."""
     column: int
+    """Column of the term's command."""
     low: float
+    """Usual smallest value, for the slider of a viewer."""
     high: float
+    """Usual largest value, for the slider of a viewer."""
     unit: str = ""
+    """Unit of the value; empty: unknown."""
 
     @property
     def label(self) -> str:
@@ -143,10 +148,10 @@ class CommandManager(TensorState):
         return float(self._by_name[knob.term].instance.command[env_id, knob.column])
 
     def markers(self) -> list[Marker]:
-        """Return the markers of all terms; one without a label has the term's name.
+        """Return the markers of all terms; a marker without a label gets the name of its term.
 
         Raises:
-            ConfigError: for a value that is not a marker with one row for each environment.
+            ShapeError: for a value that is not a marker with one row for each environment.
         """
         found: list[Marker] = []
         for term in self.terms:

@@ -1,6 +1,6 @@
-"""Settings that a curriculum changes, such as weights, ranges and limits: each is a tensor, which is read at each use.
+"""Settings that a curriculum changes, such as weights, ranges and limits: each is a tensor that terms read at each use.
 
-A curriculum can therefore change them on the GPU, also in a step that is captured as a CUDA graph.
+A curriculum can therefore change the settings on a GPU, also in a step that is captured as a CUDA graph.
 """
 
 from __future__ import annotations
@@ -73,8 +73,9 @@ class TunableValues:
                     return self._tensor(path[: depth + 1], value)[tuple(int(index) for index in path[depth + 1 :])]
                 except (ValueError, IndexError):
                     rest = ".".join(path[depth + 1 :])
-                    raise NameProblem(f"a curriculum cannot change '{address}': it has no element '{rest}'") from None
-        raise NameProblem(f"a curriculum cannot change '{address}': it must name a number or a list of numbers")
+                    message = f"a curriculum cannot change '{address}': the setting has no element '{rest}'"
+                    raise NameProblem(message) from None
+        raise NameProblem(f"a curriculum cannot change '{address}': name a number or a list of numbers")
 
     def _tensor(self, path: Path, value: object) -> Tensor:
         if path not in self._tensors:

@@ -20,7 +20,8 @@ Callback = Callable[[Selection], None]
 class EventManager(TensorState):
     """Manager of the event terms. Each environment has its own interval timers, except those with `global_time: true`.
 
-    After events that change masses, inertias or the like, the engine recomputes the constants that derive from them.
+    After events that change masses, inertias and similar fields of the model, the engine recomputes the constants that
+    MuJoCo derives from these fields.
     """
 
     def __init__(self, terms: list[BoundTerm], context: EnvContext) -> None:
@@ -109,7 +110,7 @@ class EventManager(TensorState):
         return {"steps_left": self._steps_left, "fired_at": self._fired_at}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Restore the state returned by `state_dict()`; older checkpoints have no `fired_at`."""
+        """Restore the state returned by `state_dict()`. Checkpoints of earlier versions of rlcli have no `fired_at`."""
         super().load_state_dict({"fired_at": self._fired_at, **state})
 
     def _derive_constants(self, fired: Sequence[BoundTerm], selection: Selection) -> None:

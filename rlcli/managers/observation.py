@@ -30,7 +30,7 @@ class _Group:
 
 
 _FINAL = np.uint64(0x46494E414C)
-"""Number that changes the random streams for final observations, so that they have other noise than all others.
+"""Number that changes the random streams for final observations: their noise differs from that of other observations.
 
 It is combined with the index of a stream by xor.
 """
@@ -80,8 +80,8 @@ class ObservationManager(TensorState):
         Histories, delays and filters do not advance.
 
         Args:
-            rows: the environments to compute; other rows are not valid. Its random numbers depend on the current step.
-                None: all environments.
+            rows: the environments to compute, with random numbers that depend on the current step; other rows of the
+                result are not valid. None: all environments.
         """
         draws = self._draws(_FINAL)
         self.repeats_calls = True

@@ -94,7 +94,7 @@ class Pipeline:
 
     @property
     def is_plain(self) -> bool:
-        """Whether the observation only copies a few columns: that is faster for all environments than for some."""
+        """Whether the pipeline only copies a few columns: to copy all rows is then faster than to select some rows."""
         return not self._stages and self.size <= _FEW_COLUMNS
 
     @property
@@ -134,7 +134,7 @@ class Pipeline:
 
     @property
     def resets(self) -> list[Callable[[Selection], None]]:
-        """Return the functions to call with the environments that start a new episode."""
+        """The functions to call with the environments that start a new episode."""
         return [*resets([self.term]), *(stage.reset for stage in self._stages if type(stage).reset is not Stage.reset)]
 
     def tensors(self) -> dict[str, Tensor]:
@@ -323,7 +323,7 @@ class Delay(Stage):
 
 
 def make_delay(term: BoundTerm, width: int, context: EnvContext) -> Delay | None:
-    """Return the delay of an observation or action term; None if it has none.
+    """Return the delay of an observation or action term; None if the term has no delay, or a delay of 0 steps.
 
     Raises:
         ShapeError: for a delay in seconds that is no multiple of the control period `step_dt` [s].

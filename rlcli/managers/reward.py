@@ -1,4 +1,7 @@
-"""Manager of the reward terms. The reward of a step is the sum of weight x value x step_dt over the terms."""
+"""Manager of the reward terms. The reward of a step is the sum of weight x value x step_dt over the terms.
+
+With `reward_dt_scaling: false` the factor step_dt is 1.
+"""
 
 from __future__ import annotations
 
@@ -125,7 +128,7 @@ class RewardManager(TensorState):
         """Check that the terms of the last step are finite.
 
         Raises:
-            DivergedError: with the first term that is not.
+            DivergedError: with the first term that is not finite.
         """
         for term, row in zip(self.terms, self._rows, strict=True):
             term.require_finite(row, f"reward term '{term.name}'")
@@ -139,7 +142,7 @@ class RewardManager(TensorState):
             reset(selection)
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return the episode sums."""
+        """Return the sums of the reward terms over the running episodes, by name."""
         return {"sums": self._sums, "divergence_sums": self._divergence_sums}
 
 

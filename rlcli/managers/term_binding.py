@@ -43,7 +43,9 @@ class BoundTerm:
     """
 
     name: str
+    """Name of the term in the YAML."""
     path: Path
+    """Path of the term in the configuration, such as `("rewards", "alive")`."""
     config: TermConfig
     resolved: Resolved
     """The configuration of the task."""
@@ -183,7 +185,7 @@ class Binder:
         """Import a term and return its function or class.
 
         Raises:
-            TaskError: if its module does not import.
+            TaskError: if the import of the term's module fails.
         """
         if signature.target is not None:
             return signature.target
@@ -204,7 +206,7 @@ class Binder:
         """Raise all problems at once.
 
         Raises:
-            ConfigError: if there are any.
+            ConfigError: if there are problems.
         """
         if self.problems:
             raise ConfigError(self.problems)
@@ -297,7 +299,7 @@ def first_value(term: BoundTerm) -> Any:
     """Call a term for the first time, when the environment is built.
 
     Raises:
-        ShapeError: if the term raises a ValueError; it has the message of the ValueError.
+        ShapeError: if the term raises a ValueError, with the message of the ValueError.
     """
     try:
         return term.call()
@@ -314,12 +316,12 @@ class CheckedTerm:
 
     Args:
         term: the term.
-        value: its first value.
+        value: the first value of the term.
         shape: the shape that each value must have.
         is_mask: whether the values are truth values, as those of terminations are.
 
     Raises:
-        ShapeError: if the first value is wrong; calls raise it for later ones.
+        ShapeError: if the first value is wrong. A call raises a ShapeError for a later value that is wrong.
     """
 
     __slots__ = ("_call", "_dtype", "_is_mask", "_shape", "_term")

@@ -33,7 +33,11 @@ class TerminationManager:
         ]
 
     def compute(self, diverged: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Return where this step terminates episodes, and where they time out. (num_envs,) bool each"""
+        """Return where this step terminates episodes, and where episodes time out. (num_envs,) bool each
+
+        Args:
+            diverged: where the simulation diverged, which terminates the episode, (num_envs,) bool; None: nowhere.
+        """
         self.fired = {} if diverged is None else {DIVERGED: diverged}
         failed: list[Tensor] = list(self.fired.values())
         timed_out: list[Tensor] = []

@@ -225,7 +225,7 @@ def test_state_dict_restores_curriculum(tmp_path):
         ("reward.alive.weight", "did you mean 'rewards'"),
         ("rewards.alive.func", "'rewards.alive' has no setting 'func' that may change"),
         ("rewards.alive", "must name a number"),
-        ("rewards.alive.weight.0", "it has no element '0'"),
+        ("rewards.alive.weight.0", "the setting has no element '0'"),
         ("sim.dt", "the task has no setting 'sim' that may change"),
         ("terminations.time_out.time_out", "has no setting 'time_out' that may change"),
     ],
