@@ -191,7 +191,7 @@ class JointPositionToLimits(_ScaledJointAction):
         finite = self.entity.data.soft_joint_pos_limits[self.joints].isfinite().all(dim=-1)
         if self.rescale_to_limits and not bool(finite.all()):
             unlimited = self.elements[int((~finite).nonzero()[0, 0])]
-            message = f"joint '{unlimited}' has no position limits, but the action is scaled to them"
+            message = f"joint '{unlimited}' has no position limits, to which the action could be scaled"
             raise NameProblem(message, "give the joint a range in the MJCF, or use joint_position")
 
     def _compute_command(self, action: Tensor) -> None:
@@ -261,7 +261,7 @@ class _BinaryJoint(_JointAction):
         values = self._per_joint(command, math.nan)
         if bool(values.isnan().any()):
             name = self.elements[int(values.isnan().nonzero()[0, 0])]
-            raise NameProblem(f"{key} has no value for joint '{name}'; add one")
+            raise NameProblem(f"{key} has no value for joint '{name}'; add a value")
         return values
 
 

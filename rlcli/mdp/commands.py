@@ -39,7 +39,7 @@ class NullCommand(Term):
 
 @dataclass(kw_only=True, eq=False)
 class _VelocityCommand(EntityTerm, TensorState):
-    """Base class of velocity commands: drawn velocities, 0 where the robot is to stand still.
+    """Base class of velocity commands: random velocities, 0 where the robot is to stand still.
 
     rel_standing: fraction of the commands that are zero, so that the robot is to stand.
     """
@@ -80,8 +80,8 @@ class _VelocityCommand(EntityTerm, TensorState):
     def markers(self) -> list[Marker]:
         """Return arrows above the root: green for the command, blue for the actual velocity.
 
-        An arrow above the root shows how far the root moves in one second. An arrow ahead of it shows the yaw rate: how
-        far its start point moves sideways in one second.
+        An arrow above the root shows how far the root moves in one second. An arrow ahead of the root shows the yaw
+        rate: how far the start point of the arrow moves sideways in one second.
         """
         data = self.entity.data
         actual = torch.cat([data.root_lin_vel_b[:, :2], data.root_ang_vel_b[:, 2:]], dim=1)

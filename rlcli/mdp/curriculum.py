@@ -14,11 +14,12 @@ from rlcli.sim.env_selection import Selection
 
 @dataclass(kw_only=True, eq=False)
 class Stages(Term):
-    """Schedule that changes a setting (`address`) in stages: at step number `steps[i]` it becomes `values[i]`.
+    """Schedule that changes a setting (`address`) in stages: at step number `steps[i]` the setting becomes `values[i]`.
 
-    address: path of the setting, such as `rewards.alive.weight`. Before the first step it keeps its value. `steps` are
-    numbers of calls of `env.step` since the training began, in rising order. Isaac Lab: modify_reward_weight,
-    modify_env_param, modify_term_cfg; mjlab: reward_curriculum, termination_curriculum, commands_vel.
+    address: path of the setting, such as `rewards.alive.weight`. Before step `steps[0]` the setting has its configured
+    value. `steps` are numbers of calls of `env.step` since the training began, in rising order. Isaac Lab:
+    modify_reward_weight, modify_env_param, modify_term_cfg; mjlab: reward_curriculum, termination_curriculum,
+    commands_vel.
     """
 
     address: Address

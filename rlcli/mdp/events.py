@@ -1,7 +1,7 @@
 """Event terms. Each changes the environments of a `Selection`, which also draws random numbers for them.
 
-The random numbers depend only on the seed, the term, the environment and the number of its episode. Those of interval
-events depend on the training step instead of the episode.
+The random numbers depend only on the seed, the term, the environment and the index of its episode. The random numbers
+of interval events depend on the training step instead of the episode.
 """
 
 from __future__ import annotations
@@ -118,9 +118,9 @@ def reset_root_state_uniform(
 ) -> None:
     """Reset the root to its default state plus uniform offsets.
 
-    x, y, z [m] are ranges in the world frame; linear_velocity [m/s] and angular_velocity [rad/s] have one range for
-    each of its axes. roll, pitch, yaw [rad] are ranges of a rotation in the root's default frame. The position is
-    relative to the environment's origin.
+    x, y, z [m] are ranges along the axes of the world; linear_velocity [m/s] and angular_velocity [rad/s] have one
+    range for each axis of the world. roll, pitch, yaw [rad] are ranges of a rotation in the root's default frame. The
+    position is relative to the environment's origin.
     """
     default = selection.read(entity.data.default_root_state)
     offset = selection.uniform(*_bounds(env, x, y, z), (3, 1)).squeeze(2)
@@ -170,7 +170,7 @@ def reset_scene_to_default(env: ManagedEnv, selection: Selection) -> None:
 
 @dataclass(eq=False)
 class RandomizeTerrainLevel(Term):
-    """Random terrain level (difficulty) for each episode, on the environment's own terrain type.
+    """Random terrain level (difficulty) for each episode; the terrain type of the environment stays the same.
 
     Declare it before the event that places the robot. mjlab: `randomize_terrain`, which draws the terrain type, too.
     """

@@ -174,7 +174,7 @@ def body_state_b(env: ManagedEnv, *, entity: Entity = "robot", bodies: Bodies = 
 
 @reads_body_forces
 def body_incoming_wrench(env: ManagedEnv, *, entity: Entity = "robot", bodies: Bodies = ".*") -> Tensor:
-    """Force and torque of the parent on each body, at the body's origin, in its frame [N, N m]. (num_envs, 6 k)
+    """Force and torque of the parent on each body, at the body's origin, in the body's frame [N, N m]. (num_envs, 6 k)
 
     Values of the last substep. Isaac Lab: `body_incoming_wrench`.
     """
@@ -194,7 +194,7 @@ def generated_commands(env: ManagedEnv, *, command: Command, columns: list[int] 
 def body_to_goal(
     env: ManagedEnv, *, entity: Entity = "robot", bodies: Bodies, command: Command, columns: list[int] | None = None
 ) -> Tensor:
-    """Vector from a body to the goal of a pose command of `entity`, in its root's frame [m]. (num_envs, k)"""
+    """Vector from a body to the goal of a pose command, in the frame of the root of `entity` [m]. (num_envs, k)"""
     offset = goal_in_world(entity, command) - single(entity.data.body_pos_w[:, bodies], "body")
     return _columns_of(rotate_inverse(entity.data.root_quat_w, offset), columns)
 
@@ -235,7 +235,7 @@ def imu_ang_vel(env: ManagedEnv, *, entity: Entity = "robot", sensors: Sensors) 
 def imu_lin_acc(env: ManagedEnv, *, entity: Entity = "robot", sensors: Sensors) -> Tensor:
     """Acceleration of an `accelerometer` sensor in the MJCF, in its own frame [m/s^2]. (num_envs, 3)
 
-    Value of the last substep. Like a real sensor it reads g upwards at rest, and 0 in free fall.
+    Value of the last substep. Like a real accelerometer, the sensor reads g upwards at rest, and 0 in free fall.
     """
     return _reading(entity, sensors, 3, "accelerometer")
 
@@ -243,15 +243,15 @@ def imu_lin_acc(env: ManagedEnv, *, entity: Entity = "robot", sensors: Sensors) 
 def height_scan(env: ManagedEnv, *, sensor: RaySensor, offset: float = 0.5) -> Tensor:
     """Height of the sensor above the point that each ray hits, minus `offset` [m]. (num_envs, r)
 
-    A ray without a hit counts as a hit at its full length. Isaac Lab: infinite there.
+    A ray without a hit counts as a hit at its full length. Isaac Lab: such a ray has an infinite value.
     """
     return sensor.position[:, 2:3] - sensor.hits[:, :, 2] - offset
 
 
 def image(env: ManagedEnv, *, sensor: CameraSensor, normalize: bool = True) -> Tensor:
-    """Image of a camera, rows from the top: colours, or distances [m]. (num_envs, c, h, w)
+    """Image of a camera, rows from the top: colors, distances [m] or ids of bodies. (num_envs, c, h, w)
 
-    A distance is 0 where nothing is visible. Colours are 0 to 255; with `normalize` they are divided by 255, and the
+    A distance is 0 where nothing is visible. Colors are 0 to 255; with `normalize` they are divided by 255, and the
     mean of each channel of the image is subtracted. Isaac Lab: channels last.
     """
     image = sensor.image.movedim(-1, 1).float().contiguous()
@@ -317,7 +317,7 @@ def ee_velocity(env: ManagedEnv, *, entity: Entity = "robot", sites: Sites) -> T
 def object_position_in_robot_root_frame(
     env: ManagedEnv, *, entity: Entity = "robot", object: Entity = "object"
 ) -> Tensor:
-    """Position of an object relative to the root of `entity`, in its frame [m]. (num_envs, 3)
+    """Position of an object relative to the root of `entity`, in the frame of this root [m]. (num_envs, 3)
 
     Isaac Lab: also `object_pos_b`.
     """
@@ -358,7 +358,7 @@ class RelEeDrawerDistance(HandleTerm):
 def object_to_goal_distance(
     env: ManagedEnv, *, entity: Entity = "robot", object: Entity = "object", command: Command
 ) -> Tensor:
-    """Vector from an object to the goal of a pose command of `entity`, in its root's frame [m]. (num_envs, 3)
+    """Vector from an object to the goal of a pose command, in the frame of the root of `entity` [m]. (num_envs, 3)
 
     mjlab: `object_to_goal_distance`.
     """
@@ -380,7 +380,7 @@ def _columns_of(value: Tensor, columns: list[int] | None) -> Tensor:
     if columns is None:
         return value
     if not columns or not all(0 <= column < value.shape[1] for column in columns):
-        raise ValueError(f"`columns` is {columns}; give one or more of 0 to {value.shape[1] - 1}, or leave it out")
+        raise ValueError(f"`columns` is {columns}; give one or more of 0 to {value.shape[1] - 1}, or null for all")
     return torch.stack([value[:, column] for column in columns], dim=1)
 
 
@@ -393,5 +393,5 @@ def _reading(entity: Entity, sensors: Sensors, size: int, kind: str) -> Tensor:
     values = entity.data.sensordata[:, sensors]
     if values.shape[1] != size:
         found = f"`sensors` selects {values.shape[1]} columns of sensor data"
-        raise ValueError(f"{found}; select one {kind} sensor, which has {size}")
+        raise ValueError(f"{found}; select one {kind} sensor, which has {size} columns")
     return values

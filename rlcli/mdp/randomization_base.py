@@ -45,7 +45,10 @@ class Ranges:
 
 @functools.lru_cache(maxsize=1024)
 def _table(device: torch.device, *pairs: tuple[float, float]) -> Tensor:
-    """Return the range ends on the device; cached, as a captured step must not make new tensors. (ranges, 2)"""
+    """Return the ends of the ranges as a tensor. (ranges, 2)
+
+    The tensor is cached, because a step that is captured as a CUDA graph must not create tensors.
+    """
     return torch.tensor(pairs, dtype=torch.float32, device=device)
 
 
@@ -157,7 +160,7 @@ class Randomization(RangeKeys, FieldRandomization):
 class AxisRandomization(DrawKeys, FieldRandomization):
     """Base class of terms that draw some components (axes) of an element's vector, such as the z of a position.
 
-    `range` is one range for all these axes, or a list with one range for each.
+    `range` is one range for all these axes, or a list with one range for each axis.
     """
 
     axes: list[int] | None = None
@@ -244,7 +247,7 @@ def require_supported(
         hint: what the user can do.
 
     Raises:
-        NameProblem: with the names of the elements that cannot be randomised, and of those that can.
+        NameProblem: with the names of the elements that cannot be randomised, and of the elements that can.
     """
     able = dict(zip(entity.names[kind], supported, strict=True))
     bad = [name for name in element_names(entity, kind, index) if not able[name]]

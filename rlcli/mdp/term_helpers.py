@@ -18,7 +18,7 @@ from rlcli.task import ContactSensor, Entity, Sites
 
 
 def constant(values: Sequence[float] | Tensor, device: torch.device) -> Tensor:
-    """Return numbers of the configuration as a tensor. It is made once: a captured CUDA graph cannot make tensors."""
+    """Return numbers of the configuration as a tensor, which is cached: a CUDA graph cannot create tensors."""
     return values if isinstance(values, Tensor) else _constant(tuple(values), device)
 
 
@@ -69,7 +69,7 @@ def require_one_per_body(values: Tensor, sensor: ContactSensor, key: str) -> Ten
         key: the term's key that selects the elements, such as `sites`.
 
     Raises:
-        ValueError: if their numbers differ.
+        ValueError: if the number of elements differs from the number of bodies.
     """
     if values.shape[1] != sensor.found.shape[1]:
         found, wanted = values.shape[1], sensor.found.shape[1]

@@ -166,7 +166,7 @@ class RandomizeActuatorStrength(ActuatorTerm, DrawingTerm):
     """Random strength of actuators: a factor on their effort and its limits; 0.9 is a motor that is 10 % too weak.
 
     The term supports MuJoCo's own actuators whose force is linear, and actuator models. `applied_effort` of an actuator
-    model is the effort before the factor. No other event may change gains or limits of the same model.
+    model is the effort before the factor. No other event may change gains or effort limits in the task.
     """
 
     derives = False
@@ -215,7 +215,8 @@ def _changes_actuators(event: Any) -> bool:
 class RandomizeModelField(DrawKeys, FieldRandomization):
     """Random values of any field of MuJoCo's MjModel that may differ between environments.
 
-    field: its name in MjModel. names: the elements to change. axes: the columns of an element to change; default all.
+    field: name of the field in MjModel. names: the elements (bodies, joints, ...) to change. axes: the columns of an
+    element to change; null: all.
     """
 
     entity: Entity = "robot"

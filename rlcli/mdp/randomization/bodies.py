@@ -90,7 +90,7 @@ class RandomizeBodyQuat(OrientationRandomization, BodyTerm):
 
 @dataclass(kw_only=True, eq=False)
 class RandomizeGravity(FieldRandomization):
-    """Random gravity, world frame [m/s^2]. Observations of the direction of gravity follow it."""
+    """Random gravity, world frame [m/s^2]. Observations of the direction of gravity use the random value."""
 
     model_field = "opt.gravity"
 

@@ -23,9 +23,9 @@ from rlcli.sim.env_selection import Columns
 class RandomizeGeomFriction(AxisRandomization, GeomTerm):
     """Random friction of geoms: axis 0 is sliding, axis 1 torsional [m], axis 2 rolling [m].
 
-    In a contact of two geoms with equal priority MuJoCo uses the larger friction, so a lower one would have no effect.
-    With `prevail` the chosen geoms therefore get a higher priority than all others. MuJoCo then also uses their
-    `condim`, `solref` and `solimp` in their contacts.
+    In a contact of two geoms with equal priority MuJoCo uses the larger friction, so a low friction of one geom may
+    have no effect. With `prevail` the chosen geoms therefore get a higher priority than all other geoms. In their
+    contacts MuJoCo then also uses the `condim`, `solref` and `solimp` of the chosen geoms.
     """
 
     model_field = "geom_friction"

@@ -48,7 +48,7 @@ class RandomizeJointStiffness(_JointField):
 
 @dataclass(kw_only=True, eq=False)
 class RandomizeJointRange(DrawKeys, JointTerm):
-    """Random position limits of joints [m or rad]. Terms that read the limits follow them.
+    """Random position limits of joints [m or rad]. Terms that read the limits get the random limits.
 
     lower, upper: ranges for the two limits; a limit without a range stays.
     """
@@ -81,7 +81,7 @@ class RandomizeJointRange(DrawKeys, JointTerm):
 class RandomizeDefaultJointPos(RangeKeys, JointTerm, TensorState):
     """Random default joint positions [m or rad], like errors of joint encoders.
 
-    Resets, actions and observations that are relative to the defaults follow them.
+    Resets, actions and observations that are relative to the defaults use the random values.
     """
 
     derives = False

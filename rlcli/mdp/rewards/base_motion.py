@@ -159,7 +159,7 @@ class ProgressReward(EntityTerm, TensorState):
         return progress
 
     def reset(self, selection: Selection) -> None:
-        """Start new episodes at their start positions, which are written already."""
+        """Store the start positions of new episodes; reset events have already written them."""
         # read qpos, because derived positions are computed only after all terms are reset
         first, _ = self.entity.floating()
         position = selection.read(self.entity.engine.field("qpos"), slice(first, first + 2)).float()

@@ -189,7 +189,7 @@ def air_time_reward(
 
     (num_envs,)
 
-    Moving: each foot gives the time since it last touched down or lifted off, and 0 if that is above `mode_time`.
+    Moving: each foot gives the time since it last touched down or lifted off, and 0 once that time is `mode_time`.
     Standing: each foot gives its time in contact minus its time in the air, clipped to +-`mode_time`. A robot is moving
     if the command is not zero or the root is faster than `velocity_threshold` [m/s].
     """
@@ -201,7 +201,10 @@ def air_time_reward(
 
 
 def air_time_variance_penalty(env: ManagedEnv, *, sensor: ContactSensor) -> Tensor:
-    """Variance over feet of the last air times and contact times, each at most 0.5 s [s^2]. (num_envs,)"""
+    """Variance over feet of the last air time, plus the variance of the last contact time [s^2]. (num_envs,)
+
+    Each time is clipped to at most 0.5 s.
+    """
     return sensor.last_air_time.clamp(max=0.5).var(dim=1) + sensor.last_contact_time.clamp(max=0.5).var(dim=1)
 
 

@@ -53,10 +53,11 @@ def joint_pos_limits(env: ManagedEnv, *, entity: Entity = "robot", joints: Joint
 class JointPosLimitsPenaltyRatio(JointTerm):
     """Sum over joints of a value that rises from 0 at `threshold` to the gear ratio at the soft limit. (num_envs,)
 
-    A joint position is scaled to x: -1 at the lower and 1 at the upper soft limit. The value of a joint is
-    (|x| - threshold) / (1 - threshold) x gear_ratio if |x| > threshold, otherwise 0; 0 also for a joint without limits.
+    A joint position is scaled to x: -1 at the lower and 1 at the upper soft limit (at the joint's own limits if
+    `soft_joint_pos_limit_factor` is above 1). The value of a joint is (|x| - threshold) / (1 - threshold) x gear_ratio
+    if |x| > threshold, otherwise 0; 0 also for a joint without limits.
 
-    gear_ratio: one for all joints, or one for each in the order of `joints`.
+    gear_ratio: one number for all joints, or one number for each joint in the order of `joints`.
     """
 
     threshold: float = 0.98
