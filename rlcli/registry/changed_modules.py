@@ -1,4 +1,4 @@
-"""Find and undo changes that the code of a task or plugin makes to modules of Python and of libraries.
+"""Detection and removal of changes that the code of a task or plugin makes to modules of Python and of libraries.
 
 An example of such a change is `time.time = None`. `ModuleCopies` restores what rlcli needs to report an error.
 `change_of_module` searches the code for the line that makes the change, and returns an error that names the line.
@@ -24,7 +24,7 @@ _CHANGING = ("clear", "pop", "popitem", "update", "__setitem__", "__delitem__")
 
 
 class ModuleCopies:
-    """Copies of modules that rlcli needs to report an error, from before the code of a task runs."""
+    """Copies of the modules that rlcli needs to report an error; create the object before the code of a task runs."""
 
     def __init__(self) -> None:
         self._loaded = sys.modules
@@ -35,8 +35,9 @@ class ModuleCopies:
     def restore(self, is_callable: type = callable) -> TaskError | None:  # type: ignore[assignment]
         """Restore what code of a task has deleted or replaced; return an error if these were built-in functions.
 
-        Restored are built-in functions, functions of other modules in place of which there is now a value or nothing,
-        and modules that are missing in `sys.modules`. No built-in function is called until they are restored.
+        The method restores all built-in functions, functions of `os`, `threading` and `time` that are missing or are no
+        longer callable, and modules that are missing in `sys.modules`. It calls no built-in function before it has
+        restored them.
 
         Args:
             is_callable: the built-in `callable`.
@@ -62,9 +63,9 @@ class ModuleCopies:
 
 
 def change_of_module(error: BaseException) -> TaskError | None:
-    """Return an error that names the line of a task's code that changes a module, the probable reason for `error`.
+    """Return an error that names the first line of a task's code that changes a module; None if there is no such line.
 
-    If several lines change modules, the error names the first one; without such a line return None.
+    The change is probably the reason for `error`.
     """
     for place, name in _changes():
         return TaskError(

@@ -154,7 +154,7 @@ def find_entry(group: str, name: str, *, what: str) -> Entry:
         plugin = excluded.distribution
         value = os.environ.get("RLCLI_PLUGINS", "").strip()
         excluded_by = f"RLCLI_PLUGINS={value}" if value else plugins_chosen_by()
-        hint = "unset RLCLI_PLUGINS" if value else f"add {plugin} to it, or remove the key"
+        hint = "unset RLCLI_PLUGINS" if value else f"add {plugin} to this key, or remove the key"
         raise TaskError(f"{what} '{name}' is installed, but {excluded_by} excludes its plugin {plugin}", hint=hint)
     names = list(dict.fromkeys(e.name for e in entries))
     distributions = listing(sorted({f"{e.distribution} {e.version}" for e in entries}))
@@ -193,10 +193,7 @@ def unknown_wanted() -> str:
 
 
 def plugins_chosen_by() -> str:
-    """Return, as text for messages, which setting chooses the enabled plugins.
-
-    It is the environment variable RLCLI_PLUGINS, or the key `plugins` in the settings file.
-    """
+    """Return, as text for messages, what chooses the enabled plugins: RLCLI_PLUGINS, or a key of the settings file."""
     return "RLCLI_PLUGINS" if os.environ.get("RLCLI_PLUGINS", "").strip() else f"the key 'plugins' in {settings_file()}"
 
 
@@ -204,8 +201,9 @@ def plugins_chosen_by() -> str:
 def malformed_metadata_ignored() -> Iterator[None]:
     """Make distributions with malformed metadata appear as distributions without entry points in the `with` block.
 
-    torch and TensorBoard read the entry points of all packages when they are imported. Without this, one malformed file
-    of an unrelated package would end every command. `catalog` reports which distribution it is.
+    torch and TensorBoard read the entry points of all packages when they are imported. Without this context, one
+    malformed file of an unrelated package would end every command. `catalog` returns the distributions with malformed
+    metadata.
     """
     before = vars(metadata.Distribution)["entry_points"]
 

@@ -1,6 +1,6 @@
 """Placeholders for modules whose import failed in a package that registers several tasks.
 
-With the placeholder, the other tasks of the package can still be used; its use raises the error of the import.
+With a placeholder, the other tasks of the package can still be used. Its use raises the error of the failed import.
 """
 
 import logging
@@ -65,8 +65,8 @@ def report_failures() -> None:
 def can_be_left_out(name: str, level: int, file: Path) -> bool:
     """Return whether a task file's failing import may be left out, because it may belong to another task.
 
-    This is so if the file is the `__init__.py` of a package and registers tasks with Gymnasium, or the imported package
-    does.
+    The file must be the `__init__.py` of a package, and this file or the `__init__.py` of the imported package must
+    register tasks with Gymnasium.
 
     Args:
         name: name of the module in the import statement, without leading dots.
@@ -80,7 +80,10 @@ def can_be_left_out(name: str, level: int, file: Path) -> bool:
 
 
 def error_location(error: BaseException) -> str:
-    """Return ` (file:line)`, for messages, of the code that raised an error: if possible of the task's own code."""
+    """Return ` (file:line)` of the code that raised an error, for messages.
+
+    The line of the task's own code is preferred to lines of libraries and of rlcli; the text is empty without a line.
+    """
     frames = [
         (frame.f_code.co_filename, line, is_framework(str(frame.f_globals.get("__name__", ""))))
         for frame, line in traceback.walk_tb(error.__traceback__)

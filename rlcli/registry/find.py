@@ -30,8 +30,8 @@ def path_of(word: str) -> Path:
 def find_task(name: str) -> TaskSource:
     """Return a task by name, by `distribution:name`, by the path of its folder, or as `file.py:attribute`.
 
-    Installed tasks are searched first: a folder with the name of an installed task needs a slash, `./cartpole`. So
-    does a folder with the name of a keyword, `./latest`.
+    Installed tasks are searched first: a folder with the name of an installed task needs a slash, `./cartpole`. A
+    folder with the name of a keyword also needs a slash, `./latest`.
 
     Raises:
         TaskError: if the task is unknown, ambiguous, broken, or needs a newer rlcli.

@@ -1,6 +1,7 @@
 """Formats: plugins (entry-point group `rlcli.formats`) that read the task files of other frameworks.
 
-The module finds the installed formats. It also knows formats whose plugin is not installed, to say what to install.
+The module finds the installed formats. For known formats whose plugin is not installed, it returns an error with the
+`pip install` command.
 """
 
 import functools
@@ -188,7 +189,7 @@ def format_of_key(keys: Mapping[str, Any]) -> Format | None:
 
 
 def format_of_module(module: str) -> Format | None:
-    """Return the installed format whose plugin contains a module, named by its dotted name; None if none does."""
+    """Return the installed format whose plugin contains a module (a dotted name); None if there is no such format."""
     top = module.partition(".")[0]
     return next((_load(entry) for entry in catalog(FORMATS)[0] if entry.package == top), None)
 
@@ -241,7 +242,7 @@ def require_format(path: Path) -> None:
 
 
 def require_module(error: BaseException) -> None:
-    """Raise a better error if `error` is the failed import of a module of a known format that is not installed.
+    """Raise an error if `error` is the failed import of a module that belongs to a known format without its plugin.
 
     Raises:
         DependencyError: with the `pip install` command of the format's plugin.

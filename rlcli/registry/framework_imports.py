@@ -1,9 +1,9 @@
-"""Import system for task files of another framework, whose modules a format's plugin replaces by its own.
+"""Import system for task files of another framework: imports of the framework's modules get modules of a plugin.
 
 For example, `import isaaclab.envs` in a task file imports a module of the plugin. The files of a task are executed with
-their own `__import__`, also when their functions import something later. No other code uses it, and `sys.modules` never
-has an entry for another framework: the framework itself, if it is installed, is not imported for a task, and other code
-can still import it.
+their own `__import__`, also when their functions import something later. No other code uses this `__import__`, and
+`sys.modules` never has an entry for another framework: the framework itself, if it is installed, is not imported for a
+task, and other code can still import it.
 """
 
 import builtins
@@ -278,10 +278,11 @@ def _has_member(package: ModuleType, name: str) -> bool:
 def import_package(name: str, inner: str, file: Path) -> None:
     """Import the folder of a task's repository that an import statement `import name.inner` means, as a package.
 
-    The folder is one of the folders above the importing file, or `name` or `name/name` in one of these. So files can
-    import modules by their path in the repository (`source.robot.mdp`), from a distribution of the repository that is
-    not installed (`source/robot_assets/robot_assets`), and from a package beside their own. An installed package of
-    the name is imported instead, as a package of the task if its files import the framework of an installed format.
+    The folder is one of the folders above the importing file, or `name` or `name/name` in one of these folders. Task
+    files can therefore import modules by their path in the repository (`source.robot.mdp`), from a distribution of the
+    repository that is not installed (`source/robot_assets/robot_assets`), and from a package beside their own. An
+    installed package of the name is imported instead, as a package of the task if its files import the framework of an
+    installed format.
 
     Args:
         name: first part of the imported module's name.
@@ -335,7 +336,7 @@ def _top_of(form: Format, name: str, file: str) -> Any:
 
 
 def _alias_module(form: Format, name: str, file: str, below_top: bool = False) -> Any:
-    """Return the module with which a format replaces the module of a name; None if it does not replace it.
+    """Return the module with which a format replaces the module of a name; None if the format has no replacement.
 
     Args:
         form: the format.

@@ -1,6 +1,6 @@
 """Lookup of tasks that are not installed: a folder with a YAML file, or a configuration in Python.
 
-`rlcli.registry.find` calls it for the path of a folder or file.
+`rlcli.registry.find` calls this module for the path of a folder or file.
 """
 
 import ast
@@ -24,7 +24,7 @@ def folder_task(folder: Path, file: str = "task.yaml") -> TaskSource:
 
     Args:
         folder: the folder.
-        file: name of its YAML file.
+        file: name of the YAML file in the folder.
 
     Raises:
         TaskError: if the folder has no task, or several tasks.
@@ -82,9 +82,9 @@ _REGISTERED = re.compile(rb"""register\(\s*(?:id\s*=\s*)?["']([\w./:-]{1,200})["
 
 
 def python_config(root: Path) -> TaskSource | None:
-    """Return the task of a folder without a YAML file; None if it has none.
+    """Return the task of a folder without a YAML file; None if the folder has no task.
 
-    The configuration is `TASK` in the folder's `task.py`, or what the package registers with Gymnasium.
+    The configuration is `TASK` in the folder's `task.py`, or the one that the package registers with Gymnasium.
     """
     if _defines(root / "task.py", "TASK"):
         return python_task(f"{root / 'task.py'}:TASK", root.name)
@@ -97,7 +97,7 @@ def python_task(reference: str, name: str | None = None) -> TaskSource:
     """Return a task whose configuration is a Python object.
 
     `reference` is `file.py:attribute`, or the folder of a package: `folder` or `folder:ID`. The configuration of a
-    package is `TASK` in its `task.py`, or what it registers with Gymnasium under `ID`.
+    package is the one that the package registers with Gymnasium under `ID`; without `ID`, the only registered one.
 
     Raises:
         TaskError: if there is no such file.

@@ -69,7 +69,7 @@ def existing_model_file(root: Path, model: str) -> Path:
     with _system_errors(model):
         file = model_file(root, model).resolve()
         if ":" not in model and not file.is_relative_to(root):
-            raise TaskError(f"'{model}' lies outside the task's folder {root}; move it inside")
+            raise TaskError(f"'{model}' lies outside the task's folder {root}; move the file into this folder")
         if file.exists() and not file.is_file():
             raise TaskError(f"'{model}' in {root} is not a regular file; put an MJCF in its place")
         if not file.exists():
@@ -85,7 +85,7 @@ def _system_errors(model: str) -> Iterator[None]:
         yield
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise TaskError(f"the model '{model}' cannot be opened: {reason}; correct its path") from None
+        raise TaskError(f"the model '{model}' cannot be opened: {reason}; correct the path") from None
 
 
 def _install_hint(model: str) -> str:
@@ -114,15 +114,15 @@ def _model_file(root: Path, model: str) -> Path:
 
 def _inside(folder: Path, file: str, what: str) -> Path:
     if not (folder / file).resolve().is_relative_to(folder.resolve()):
-        raise TaskError(f"'{file}' lies outside {what}; move it inside")
+        raise TaskError(f"'{file}' lies outside {what}; name a file inside this folder")
     return folder / file
 
 
 def _menagerie_models(robot: str) -> list[Path]:
     """Return the folders that may have the model of a robot of MuJoCo Menagerie, such as `unitree_go1`.
 
-    First the robot's folder in MENAGERIE_ROOT, then those that the package mujoco-menagerie has downloaded, newest
-    first.
+    The robot's folder in MENAGERIE_ROOT comes first, then the folders that the package mujoco-menagerie has downloaded,
+    the newest first.
     """
     if not robot or set(robot) & set("*?[]"):
         return []

@@ -62,7 +62,7 @@ def load_entry(entry: Entry, kind: type) -> Any:
     if not isinstance(value, kind):
         raise TaskError(
             f"plugin {entry.distribution} {entry.version}: entry point '{entry.name}' = {entry.value} is a"
-            f" {type(value).__name__}, expected a {kind.__name__}; report it to the plugin's authors"
+            f" {type(value).__name__}, expected a {kind.__name__}; report this to the plugin's authors"
         )
     return value
 
@@ -86,13 +86,13 @@ def wrong_result(entry: Entry, what: str, value: object, expected: str) -> Plugi
     Args:
         entry: the plugin's entry point.
         what: name of the function, for the message.
-        value: the value that it returned.
+        value: the returned value.
         expected: the allowed values, in words.
     """
     plugin = f"plugin {entry.distribution} {entry.version}"
     return PluginError(
         f"{plugin}: {what} returned a {type(value).__name__}, {reprlib.repr(value)}; expected {expected}",
-        hint=f"update or uninstall {entry.distribution}; report it to its authors",
+        hint=f"update or uninstall {entry.distribution}; report this to the authors of the plugin",
     )
 
 
@@ -128,7 +128,7 @@ def import_object(reference: str) -> Any:
     """Import and return the object of a reference `package.module:Name`. What the import prints goes to stderr."""
     name, _, attributes = reference.rpartition(":")
     if not name:
-        raise ValueError("it names no object of a module; write MODULE:OBJECT")
+        raise ValueError("the reference names no object of a module; write MODULE:OBJECT")
     with contain_side_effects():
         module = importlib.import_module(name)
     return operator.attrgetter(attributes)(module)
@@ -210,7 +210,7 @@ def _restore_torch(before: _TorchSettings, changed: _TorchSettings) -> None:
     torch.set_grad_enabled(records)
     rows = zip(("default dtype", "default device", "gradient mode"), before, changed, strict=True)
     changes = " and ".join(f"{name} from {old} to {new}" for name, old, new in rows if old != new)
-    _log.warning("imported code has changed torch's %s; rlcli has restored it, as its tensors depend on it", changes)
+    _log.warning("imported code has changed torch's %s; rlcli has restored the earlier value", changes)
 
 
 def error_location(error: BaseException) -> str:
@@ -233,7 +233,8 @@ def _newer_rlcli(entry: Entry) -> str | None:
     for line in requirements:
         wanted = re.match(r"rlcli\s*(?:\[[^]]*\])?\s*\(?(?:>=|==|~=|>)\s*([0-9]+(?:\.[0-9]+)*)", line)
         if wanted and release_numbers(wanted[1]) > release_numbers(rlcli.__version__):
-            return f"it needs rlcli {wanted[1]}, this is {rlcli.__version__}: {pip_install('--upgrade rlcli')}"
+            found = f"the plugin needs rlcli {wanted[1]}, but {rlcli.__version__} is installed"
+            return f"{found}: {pip_install('--upgrade rlcli')}"
     return None
 
 

@@ -31,7 +31,7 @@ TIMEOUT_S = 30.0
 _IDLE_S = 3.0
 """Time in which a process has loaded no further plugin, after which it counts as hanging and frees its core [s]."""
 _MAX_TIMEOUTS = 2
-"""Number of entry points of one distribution that may exceed the time limit; then its other ones are skipped."""
+"""Number of entry points of one distribution that may exceed the time limit; all further ones are then skipped."""
 _MAX_PROCESSES = 64
 _SUFFIXES = (".py", ".yaml", ".xml")
 _BUILDER = "rlcli.envs.describe_plugins"
@@ -235,11 +235,11 @@ def _wait(
     """Wait for the end of a process that loads plugins, and return its exit code.
 
     Return None if a plugin, or the end after the last one, takes longer than `timeout_s`, or if `stop` is set. If the
-    process seems to hang, another one may use its core.
+    process seems to hang, another process may use its core.
 
     Args:
         process: the process.
-        file: the file to which it appends a row for each plugin that it has loaded.
+        file: the file to which the process appends a row for each plugin that it has loaded.
         wanted: number of plugins to load.
         timeout_s: time limit for one plugin [s].
         stop: ends the wait when it is set.
@@ -310,7 +310,7 @@ def _cache_file() -> Path:
 
 
 def _read_json(file: Path) -> dict[str, Any]:
-    """Return the mapping in a JSON file; an empty one if the file cannot be read."""
+    """Return the mapping in a JSON file; an empty mapping if the file cannot be read or has another content."""
     try:
         value = json.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
@@ -319,7 +319,7 @@ def _read_json(file: Path) -> dict[str, Any]:
 
 
 def _parse_details(row: object) -> Details | None:
-    """Return the `Details` in a JSON value of an untrusted file; None if it is no mapping or a type is wrong."""
+    """Return the `Details` in a JSON value of an untrusted file; None if the value is no mapping or a type is wrong."""
     if not isinstance(row, dict):
         return None
     known = {f.name: row[f.name] for f in fields(Details) if f.name in row}

@@ -29,14 +29,14 @@ SLOW_S = 10.0
 _SAMPLE_S = 1.0
 """Time between two looks at the running code [s]."""
 _MOST_TEXT = 200
-"""Largest length of a reported warning [characters]; longer ones are cut."""
+"""Largest length of a reported warning [characters]; longer warnings are cut."""
 _monotonic = time.monotonic  # the thread `_Watch` needs it even if a task deletes or replaces it
 _ENTRIES = ("rlcli.cli.app", "rlcli.envs.sharding.worker")
 """Modules that start a command or a worker. Frames outside of them belong to the program that called rlcli."""
 
 
 def error_of_task(error: BaseException) -> TaskError | None:
-    """Return a TaskError for an exception from the code of a task or plugin; None for any other.
+    """Return a TaskError for an exception from the code of a task or plugin; None for any other exception.
 
     An OSError or EOFError that rlcli's own code raised is not from a task, even if a plugin called this code: a full
     disk is not the plugin's fault.
@@ -53,7 +53,10 @@ def error_of_task(error: BaseException) -> TaskError | None:
 
 
 def _frames_of(error: BaseException) -> list[tuple[FrameType, int]]:
-    """Return the frames of an error's traceback with their lines; or, if none is a task's, of its cause."""
+    """Return the frames of an error's traceback with their lines.
+
+    If no frame runs code of a task, return the frames of the error's cause, and so on.
+    """
     seen: set[int] = set()
     frames: list[tuple[FrameType, int]] = []
     cause: BaseException | None = error
@@ -196,7 +199,7 @@ def _frames_of_command(frame: FrameType | None) -> Iterator[FrameType]:
 
 
 def place_in_task(frame: FrameType | None) -> str | None:
-    """Return file and line of the innermost code of a task that runs in a frame or its callers."""
+    """Return `file:line` of the innermost code of a task in a frame or its callers; None if there is no such code."""
     return _innermost_place(_frames_of_command(frame))
 
 
@@ -280,13 +283,15 @@ def report_lasting_threads() -> None:
         if place and not thread.daemon and thread is not threading.main_thread():
             thread.join(max(0.0, end - _monotonic()))
             if thread.is_alive():
-                warn_once(f"{place}: a thread still runs {SLOW_S:g} s after the end of the command; Ctrl-C ends it")
+                warn_once(
+                    f"{place}: a thread still runs {SLOW_S:g} s after the end of the command; Ctrl-C ends the process"
+                )
 
 
 class _OwnTime:
     """Clock of the time in which a thread runs or is blocked, without the time in which it waits for a free CPU.
 
-    Where the kernel does not measure this (not Linux), it is the time since the start.
+    Where the kernel does not measure this time (not Linux), the clock gives the time since the start.
     """
 
     def __init__(self, thread: int) -> None:
@@ -305,7 +310,7 @@ class _OwnTime:
 
 
 class _Watch(threading.Thread):
-    """Thread that looks at the running code once a second, and names calls of a task's code that do not return.
+    """Thread that looks at the running code once a second, and warns of calls of a task's code that do not return.
 
     Args:
         thread: identifier of the thread to watch, which must create this object.

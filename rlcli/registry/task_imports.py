@@ -44,7 +44,7 @@ def load_object(reference: str) -> Any:
 
 
 def load_module(name: str) -> Any:
-    """Import a module by its dotted name, or a file of a task folder by its path. Its output goes to stderr.
+    """Import a module by its dotted name, or a file of a task folder by its path; output of its code goes to stderr.
 
     The module name of a file is derived from its path, so that `task.py` of two folders are two modules.
     """
@@ -134,7 +134,7 @@ def _sibling_modules(folder: Path) -> Iterator[None]:
 
 
 def _package(folder: Path, run_start: bool = True) -> str:
-    """Import a folder as a package and return the package's name: the folder's, or a unique one if that is taken.
+    """Import a folder as a package and return the package's name: the folder's name, or a unique name if it is taken.
 
     With `run_start` false, the folder's `__init__.py` is not executed.
     """

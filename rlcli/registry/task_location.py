@@ -32,7 +32,7 @@ class TaskSource:
     task_file: Path | None = None
     """File with the class of a direct task; None for a manager-based task."""
     python: str | None = None
-    """A configuration in Python: `module:attribute`, `file.py:attribute` or the folder of a package; None: in YAML."""
+    """Configuration in Python: `module:attribute`, `file.py:attribute` or the folder of a package; None: YAML."""
     agents: tuple[tuple[str, str], ...] = ()
     """Further agents of a configuration in Python: (name, `module:attribute`)."""
     value: Any = None

@@ -164,7 +164,7 @@ def test_plugin_needing_newer_rlcli_gives_version(plugins, cli):
     plugins("early", "from rlcli.task import Wings\n", metadata=metadata)
     done = cli("show", "early-task")
     assert done.returncode == 4
-    assert "it needs rlcli 99.1, this is" in done.stderr
+    assert "the plugin needs rlcli 99.1, but" in done.stderr
 
 
 @pytest.mark.parametrize("command", ["doctor", "list-tasks"])
@@ -253,7 +253,7 @@ def test_plugin_that_changes_settings_of_torch_changes_no_training(plugins, comm
 
     plugins("sets", f"import torch\n{change}\n{SPEC}", files=FILES)
     done = command("train", "sets-task", "--num-envs", "2", "--max-iterations", "1", "--logger", "none", "--json")
-    assert f"imported code has changed torch's {message}; rlcli has restored it" in done.stderr
+    assert f"imported code has changed torch's {message}; rlcli has restored the earlier value" in done.stderr
     assert document(done)["state"] == "finished"
     assert (torch.get_default_dtype(), str(torch.get_default_device())) == (torch.float32, "cpu")
     assert torch.is_grad_enabled()
