@@ -91,7 +91,7 @@ class TaskCheck:
         """Return the content of the task's file, before any change.
 
         Args:
-            changes: changes from the command line. For a task in Python they may contain MJCF files (--model) and
+            changes: changes from the command line. For a task in Python, the changes may have MJCF files (--model) and
                 required values that the task's code does not set.
         """
         file = self.source.config  # YAML: a task, or the record of a run
@@ -127,7 +127,7 @@ class TaskCheck:
         self.add(Problem(self.layers.place(path), messages.dotted(path), message, hint))
 
     def _is_mapping(self, value: object, path: Path) -> bool:
-        """Return whether the value at a path is a mapping; add a problem if it is not."""
+        """Return whether the value at a path is a mapping; add a problem for any other value."""
         if not isinstance(value, dict):
             self.problem(path, f"expected a mapping, found {messages.format_value(value)}")
         return isinstance(value, dict)
@@ -353,7 +353,7 @@ class TaskCheck:
         return task
 
     def _validate(self, model: type[BaseModel], data: Any, at: Path) -> BaseModel | None:
-        """Validate the data at a path with a model; add the problems and return None if it is not valid."""
+        """Validate the data at a path with a model; if the data are not valid, add the problems and return None."""
         try:
             spec = None if self.format is None else self.format.spec
             context = {"open_scene": spec and spec.open_scene, "given_models": spec and not spec.models}

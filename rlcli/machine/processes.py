@@ -8,7 +8,7 @@ from rlcli.safe_text import read_number
 
 
 def python_command(*arguments: str) -> list[str]:
-    """Return the command that starts this Python with arguments. It cannot import files of the current folder."""
+    """Return the command that starts this Python with arguments, and with `-P`: no imports from the current folder."""
     return [sys.executable, "-P", *arguments]
 
 
