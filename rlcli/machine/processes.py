@@ -1,4 +1,4 @@
-"""Command line of Python subprocesses, and environment variables of processes: launchers' numbers, OpenMP settings."""
+"""Helpers for processes: command of a Python subprocess, numbers set by launchers such as torchrun, OpenMP setting."""
 
 import os
 import sys

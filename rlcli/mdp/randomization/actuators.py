@@ -1,4 +1,4 @@
-"""Randomisation of actuators, and of any model field."""
+"""Event terms that randomise gains, effort limits and strength of actuators, or any field of the model."""
 
 from __future__ import annotations
 
