@@ -343,8 +343,7 @@ def _registered_agents(kwargs: Mapping[str, Any]) -> dict[str, Any]:
 def _agent_object(entry: object) -> Any:
     """Import the settings of an agent.
 
-    If a library that the settings import is not installed, return the error instead of raising it: another agent may be
-    used.
+    If a library that the settings import is not installed, return the error: another agent may be used.
     """
     try:
         return _object(entry)

@@ -88,12 +88,7 @@ class TaskCheck:
     places: dict[Path, str] = field(default_factory=dict)  # `PythonTask.places`
 
     def document(self, changes: Iterable[Change] = ()) -> Document:
-        """Return the content of the task's file, before any change.
-
-        Args:
-            changes: changes from the command line. For a task in Python, the changes may have MJCF files (--model) and
-                required values that the task's code does not set.
-        """
+        """Return the content of the task's file. A task in Python gets MJCF files and required values from `changes`."""
         file = self.source.config  # YAML: a task, or the record of a run
         recorded = upgraded(read(file, self.source.label), file) if file.suffix != ".py" else None
         if recorded is not None and self.source.python is None and self.source.value is None:
@@ -117,13 +112,7 @@ class TaskCheck:
             raise ConfigError([Problem(self.source.label, "", text), *self.problems[:MAX_PROBLEMS]])
 
     def problem(self, path: Path, message: str, hint: str | None = None) -> None:
-        """Add a problem with the value at a path of the merged configuration.
-
-        Args:
-            path: keys of the value.
-            message: what is wrong.
-            hint: what to write instead.
-        """
+        """Add a problem with the value at a path of the merged configuration; `hint` says what to write instead."""
         self.add(Problem(self.layers.place(path), messages.dotted(path), message, hint))
 
     def _is_mapping(self, value: object, path: Path) -> bool:
@@ -243,12 +232,7 @@ class TaskCheck:
         self.layers.merge(task, lambda path: Origin(layer, self.layers.place(at + path)))
 
     def apply(self, changes: Iterable[Change], name: str | None) -> None:
-        """Set the values of overrides and flags in `layers`.
-
-        Args:
-            changes: the changes.
-            name: the agent that `agent.KEY=VALUE` changes; None: such a change is added to `problems`.
-        """
+        """Set the values of overrides and flags. `agent.KEY=VALUE` changes the agent `name`; with None, add a problem."""
         format_keys = functools.cache(formats.format_keys)  # slow: it looks for installed plugins
         for path, value, origin in changes:
             if path[0] == "agent":
