@@ -88,7 +88,7 @@ class TaskCheck:
     places: dict[Path, str] = field(default_factory=dict)  # `PythonTask.places`
 
     def document(self, changes: Iterable[Change] = ()) -> Document:
-        """Return the content of the task's file. A task in Python gets MJCF files and required values from `changes`."""
+        """Return the content of the task's file. `changes` have MJCF files and required values for a task in Python."""
         file = self.source.config  # YAML: a task, or the record of a run
         recorded = upgraded(read(file, self.source.label), file) if file.suffix != ".py" else None
         if recorded is not None and self.source.python is None and self.source.value is None:
@@ -232,7 +232,7 @@ class TaskCheck:
         self.layers.merge(task, lambda path: Origin(layer, self.layers.place(at + path)))
 
     def apply(self, changes: Iterable[Change], name: str | None) -> None:
-        """Set the values of overrides and flags. `agent.KEY=VALUE` changes the agent `name`; with None, add a problem."""
+        """Set the values of overrides and flags. `agent.KEY=VALUE` changes agent `name`; without a name add a problem."""
         format_keys = functools.cache(formats.format_keys)  # slow: it looks for installed plugins
         for path, value, origin in changes:
             if path[0] == "agent":
