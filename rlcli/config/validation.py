@@ -232,7 +232,7 @@ class TaskCheck:
         self.layers.merge(task, lambda path: Origin(layer, self.layers.place(at + path)))
 
     def apply(self, changes: Iterable[Change], name: str | None) -> None:
-        """Set the values of overrides and flags. `agent.KEY=VALUE` changes agent `name`; without a name add a problem."""
+        """Set the values of overrides and flags. `agent.KEY=VALUE` changes agent `name`; None: add a problem."""
         format_keys = functools.cache(formats.format_keys)  # slow: it looks for installed plugins
         for path, value, origin in changes:
             if path[0] == "agent":
