@@ -191,7 +191,7 @@ class DirectEnv(VecEnv):
             raise TaskError(message) from error
         if not (isinstance(task_class, type) and issubclass(task_class, DirectTask)):
             raise TaskError(
-                f"task '{source.name}' is broken: {source.task} is no subclass of DirectTask; derive the class from it"
+                f"task '{source.name}' is broken: {source.task} is no subclass of DirectTask; derive the class from DirectTask"
             )
         return task_class
 
