@@ -1,4 +1,4 @@
-"""Main function of the command `rlcli`: it builds the typer app, runs a command and returns the exit code.
+"""Main function of the command `rlcli`: build the typer app, run a command and return the exit code.
 
 Exceptions of a command, of a task's code or of a library become error messages with a hint and an exit code.
 """
@@ -181,12 +181,12 @@ def _command_name(arguments: list[str]) -> str | None:
 
 
 def _require_words(arguments: list[str]) -> None:
-    """Check that no argument of the command line is empty (`--record ""`, `--record=`) and that all are UTF-8.
+    """Check that all arguments of the command line are UTF-8, and that none is empty (`--record ""`, `--record=`).
 
     The values of environment variables `RLCLI_*` are checked too, because some of them are values of options.
 
     Raises:
-        UsageError: with the argument, and the option or variable that it belongs to.
+        UsageError: with the wrong argument, and the option or variable that it belongs to.
     """
     for position, word in enumerate(arguments):
         if not word or (word.startswith("--") and word.endswith("=")):
@@ -199,7 +199,9 @@ def _require_words(arguments: list[str]) -> None:
     for word, place in words.items():
         # surrogates stand for bytes that are not UTF-8
         if any("\ud800" <= character <= "\udfff" for character in word):
-            raise UsageError(f"{place} is not UTF-8: '{word}'", hint="rename this file or folder")
+            raise UsageError(
+                f"{place} is not UTF-8: '{word}'", hint="write the word in UTF-8, or rename the file or folder"
+            )
 
 
 def _run(arguments: list[str]) -> int:
@@ -238,7 +240,7 @@ def _run(arguments: list[str]) -> int:
 
 
 def _require_folder_and_output() -> None:
-    """Check that the current folder exists and that stdout is open: without them libraries fail with obscure errors.
+    """Check that the current folder exists and that stdout is open. Otherwise libraries fail with obscure errors.
 
     Raises:
         MachineError: if the folder was deleted, or the parent process closed stdout.
@@ -247,9 +249,10 @@ def _require_folder_and_output() -> None:
         os.getcwd()
     except OSError as error:
         message = f"the current folder cannot be used: {error.strerror}"
-        raise MachineError(message, hint="it may have been deleted; change to another folder with `cd`") from None
+        hint = "the folder may have been deleted; change to another folder with `cd`"
+        raise MachineError(message, hint=hint) from None
     if sys.stdout is None:
-        raise MachineError("the standard output is closed", hint="redirect it to a file or to /dev/null")
+        raise MachineError("the standard output is closed", hint="redirect stdout to a file or to /dev/null")
 
 
 def _as_rlcli_error(error: BaseException, arguments: list[str]) -> RlcliError:

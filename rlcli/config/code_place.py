@@ -29,7 +29,7 @@ def place_of(value: object) -> str:
 
 
 def code_origin(places: Mapping[tuple[str | int, ...], str], path: tuple[str | int, ...]) -> Origin | None:
-    """Return the place of the code that sets the value at a path; None if it is not known.
+    """Return the place of the code that sets the value at a path; None if the place is unknown.
 
     Args:
         places: path -> place of the code that sets the value there, as in `PythonTask.places`.

@@ -162,7 +162,7 @@ def _suggest_key(key: str, fields: Iterable[str], locations: KeyLocations) -> st
         return instead
     similar = did_you_mean(key, fields)
     elsewhere = [] if "func" in fields else locations.get(key, [])  # the keys of a term have their own meaning
-    belongs = f"it belongs {' or '.join(map(_inside, elsewhere))}" if 0 < len(elsewhere) <= 3 else None
+    belongs = f"the key belongs {' or '.join(map(_inside, elsewhere))}" if 0 < len(elsewhere) <= 3 else None
     if similar or belongs:
         return "; ".join(filter(None, (similar, belongs)))
     return f"allowed: {listing(sorted(fields), 40)}"
@@ -242,7 +242,7 @@ def _tags(model: type[BaseModel], path: Path) -> list[str]:
 
 
 def _length(model: type[BaseModel], path: Path) -> int | None:
-    """Return the length of the list at a path of a model; None if it is not fixed."""
+    """Return the length of the list at a path of a model; None if the length is not fixed."""
     items = (get_args(arm) for arm in _arms_at(model, path) if get_origin(arm) is tuple)
     return next((len(kinds) for kinds in items if kinds[-1] is not ...), None)
 

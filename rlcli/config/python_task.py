@@ -1,7 +1,7 @@
 """Conversion of a task's configuration in Python to the plain data that a YAML file would contain.
 
-The configuration is a `TaskConfig`, a mapping with its keys, or a function that returns one. Or it is a configuration
-of another framework with a method `__rlcli_task__(root, models) -> PythonTask`; its optional method
+The configuration is a `TaskConfig`, a mapping with its keys, or a function that returns one of them. A configuration of
+another framework has a method `__rlcli_task__(root, models) -> PythonTask`; its optional method
 `__rlcli_fill__(values)` sets required settings that have no value in the file, and returns their paths. An agent of
 another framework has a method `__rlcli_agent__(notes)`; its optional method `__rlcli_fit__(agent, observations, notes)`
 adapts the settings to the observation groups of the task.
@@ -49,7 +49,7 @@ class PythonTask:
     notes: list[Note] = field(default_factory=list)
     """How each setting was translated, for a configuration of another framework."""
     params: type[BaseModel] | None = None
-    """Model of `params` in `data`: settings that the code of another framework's task reads; None: it reads none."""
+    """Model of `params` in `data`: settings that the code of another framework's task reads; None: no such settings."""
     format: Format | None = None
     """The other framework's format to whose classes the configuration belongs; None: rlcli's own."""
     places: dict[Path, str] = field(default_factory=dict)
@@ -290,7 +290,7 @@ def _agents_in_modules(modules: Iterable[Any]) -> dict[str, Any]:
 def _registered(source: TaskSource) -> tuple[Any, dict[str, Any]]:
     """Return the configuration that a package registers with Gymnasium, and its agents by name.
 
-    They are the arguments `env_cfg_entry_point` and `AGENT_cfg_entry_point` of the registration.
+    These objects are the arguments `env_cfg_entry_point` and `AGENT_cfg_entry_point` of the registration.
     """
     module = import_file(source.root / "__init__.py")
     wanted = str(source.python).removeprefix(str(source.root)).removeprefix(":")
@@ -343,7 +343,7 @@ def _registered_agents(kwargs: Mapping[str, Any]) -> dict[str, Any]:
 def _agent_object(entry: object) -> Any:
     """Import the settings of an agent.
 
-    If a library that they import is not installed, return the error instead of raising it: another agent may be used.
+    If a library that the settings import is not installed, return the error: another agent may be used.
     """
     try:
         return _object(entry)
@@ -421,7 +421,7 @@ def _add_agents(task: PythonTask, agents: Mapping[str, Any]) -> None:
 
 
 def _read_agent(task: PythonTask, name: str, agent: object) -> dict[str, Any] | None:
-    """Return the settings of an agent as plain data; None if they have a form that rlcli cannot read.
+    """Return the settings of an agent as plain data; None if rlcli cannot read the form of the settings.
 
     Args:
         task: the task, which gets the notes about the translation.
@@ -445,6 +445,6 @@ def _report_choice(message: str) -> None:
 
 
 def _hint(error: BaseException) -> str | None:
-    """Return the hint that the plugin of another framework's format has for an error; None if there is none."""
+    """Return the hint that the plugin of another framework's format has for an error; None if there is no hint."""
     hint: str | None = first_result("hint", error)
     return hint

@@ -1,8 +1,8 @@
 """Reader of strict YAML: scalars of YAML 1.2, the position of every value, and limits that make untrusted files safe.
 
-The reader uses the event stream of PyYAML's pure-Python parser (the C parser crashes on deep nesting). It refuses, each
-with its position: duplicate keys, anchors, tags, merge keys, a second document, ambiguous scalars (`on`, `010`,
-`.nan`).
+The reader uses the event stream of PyYAML's pure-Python parser (the C parser crashes on deep nesting). The reader
+refuses duplicate keys, anchors, tags, merge keys, a second document, and ambiguous scalars (`on`, `010`, `.nan`); the
+error has the position of the mistake.
 """
 
 import contextlib

@@ -1,4 +1,4 @@
-"""Reference entries of terms: their keys with types, defaults, meanings and an example.
+"""Documentation of terms for `rlcli terms` and the reference pages: keys with types, defaults, meanings, an example.
 
 The signatures come from the source (`term_signatures`), the meanings of the keys from `rlcli/mdp/term_keys.yaml`.
 """

@@ -62,7 +62,7 @@ class SignatureError(ValueError):
 class Parameter:
     """A keyword-only parameter of a term, which is a key of the term in YAML.
 
-    `alias` is the name from `rlcli.task` in its annotation, such as `Joints`; None if it has none.
+    `alias` is the name from `rlcli.task` in its annotation, such as `Joints`; None if there is no such name.
     """
 
     name: str
@@ -90,7 +90,7 @@ class Signature:
     """First line of the docstring."""
     parameters: tuple[Parameter, ...]
     error: str | None = None
-    """Reason why the function cannot be used as a term; None if it can be used."""
+    """Reason why the function cannot be used as a term; None if there is no obstacle."""
     target: Any = None
     """The function or class itself, if it comes from a configuration in Python; None: `attribute` of the file."""
     description: str = ""
@@ -361,7 +361,7 @@ def _parameter(argument: ast.arg, default: ast.expr | None) -> Parameter:
 
 
 def _alias(node: ast.expr) -> str | None:
-    """Return the name from `rlcli.task` in an annotation, such as `Joints` in `Joints | None`; None if it has none."""
+    """Return the name from `rlcli.task` in an annotation, such as `Joints` in `Joints | None`; else None."""
     if isinstance(node, ast.Constant) and isinstance(node.value, str):
         return _alias(_quoted(node.value))
     if isinstance(node, ast.BinOp):

@@ -46,7 +46,7 @@ def parse(file: Path) -> ast.Module:
 
 
 class ClassSearch:
-    """Search for classes in source files. It stops after `MAX_CLASSES` classes.
+    """Search for classes in source files, which stops after `MAX_CLASSES` classes.
 
     Base classes are found in the same file, in other files of the same package, and in `rlcli.mdp`. `trees` is a cache
     of the syntax trees of files; new files are added to it. Methods raise SyntaxError if a file is not Python.
@@ -129,7 +129,7 @@ class ClassSearch:
 
 
 def _module_files(file: Path, node: ast.ImportFrom) -> Iterator[Path]:
-    """Yield the files that may define the module of an import statement; they may not exist.
+    """Yield the files that may define the module of an import statement; some of the files may not exist.
 
     Args:
         file: the importing file.
@@ -207,7 +207,7 @@ def _fields(source: SourceClass, search: ClassSearch) -> dict[str, _Field]:
 
 
 def _dataclass_decorator(node: ast.ClassDef) -> ast.expr | None:
-    """Return the decorator `@dataclass` or `@dataclass(...)` of a class; None without one."""
+    """Return the decorator `@dataclass` or `@dataclass(...)` of a class; None without such a decorator."""
     named = ((last_name(d.func if isinstance(d, ast.Call) else d), d) for d in node.decorator_list)
     return next((decorator for name, decorator in named if name == "dataclass"), None)
 

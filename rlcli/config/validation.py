@@ -88,12 +88,7 @@ class TaskCheck:
     places: dict[Path, str] = field(default_factory=dict)  # `PythonTask.places`
 
     def document(self, changes: Iterable[Change] = ()) -> Document:
-        """Return the content of the task's file, before any change.
-
-        Args:
-            changes: changes from the command line. For a task in Python they may contain MJCF files (--model) and
-                required values that the task's code does not set.
-        """
+        """Return the content of the task's file. `changes` have MJCF files and required values for a task in Python."""
         file = self.source.config  # YAML: a task, or the record of a run
         recorded = upgraded(read(file, self.source.label), file) if file.suffix != ".py" else None
         if recorded is not None and self.source.python is None and self.source.value is None:
@@ -117,17 +112,11 @@ class TaskCheck:
             raise ConfigError([Problem(self.source.label, "", text), *self.problems[:MAX_PROBLEMS]])
 
     def problem(self, path: Path, message: str, hint: str | None = None) -> None:
-        """Add a problem with the value at a path of the merged configuration.
-
-        Args:
-            path: keys of the value.
-            message: what is wrong.
-            hint: what to write instead.
-        """
+        """Add a problem with the value at a path of the merged configuration; `hint` says what to write instead."""
         self.add(Problem(self.layers.place(path), messages.dotted(path), message, hint))
 
     def _is_mapping(self, value: object, path: Path) -> bool:
-        """Return whether the value at a path is a mapping; add a problem if it is not."""
+        """Return whether the value at a path is a mapping; add a problem for any other value."""
         if not isinstance(value, dict):
             self.problem(path, f"expected a mapping, found {messages.format_value(value)}")
         return isinstance(value, dict)
@@ -243,12 +232,7 @@ class TaskCheck:
         self.layers.merge(task, lambda path: Origin(layer, self.layers.place(at + path)))
 
     def apply(self, changes: Iterable[Change], name: str | None) -> None:
-        """Set the values of overrides and flags in `layers`.
-
-        Args:
-            changes: the changes.
-            name: the agent that `agent.KEY=VALUE` changes; None: such a change is added to `problems`.
-        """
+        """Set the values of overrides and flags. `agent.KEY=VALUE` changes agent `name`; None: add a problem."""
         format_keys = functools.cache(formats.format_keys)  # slow: it looks for installed plugins
         for path, value, origin in changes:
             if path[0] == "agent":
@@ -353,7 +337,7 @@ class TaskCheck:
         return task
 
     def _validate(self, model: type[BaseModel], data: Any, at: Path) -> BaseModel | None:
-        """Validate the data at a path with a model; add the problems and return None if it is not valid."""
+        """Validate the data at a path with a model; if the data are not valid, add the problems and return None."""
         try:
             spec = None if self.format is None else self.format.spec
             context = {"open_scene": spec and spec.open_scene, "given_models": spec and not spec.models}

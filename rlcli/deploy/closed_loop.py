@@ -5,10 +5,10 @@ MjData. No code of the environment takes part in that loop. The environment is t
 commands and disturbances, reads the resulting states, and computes rewards and terminations. The same episodes run
 twice: once as an evaluation in the environment, once in plain MuJoCo.
 
-In a legged robot rounding errors grow until two simulations of one episode have nothing in common. If every observation
-and action agrees but the returns differ, the episodes are run again and re-synchronised: plain MuJoCo and the engine
-start each step from the same state. If both arrive at the same state within rounding, the engine's state is copied to
-plain MuJoCo. A step in which they disagree is not corrected, so that an error shows in the return.
+With a legged robot, rounding errors grow until two simulations of one episode have nothing in common. If every
+observation and action agrees but the returns differ, the episodes are run again and re-synchronised: plain MuJoCo and
+the engine start each step from the same state. If both arrive at the same state within rounding, the engine's state is
+copied to plain MuJoCo. A step in which the two states disagree is not corrected, so that an error changes the return.
 """
 
 import copy
@@ -68,7 +68,7 @@ class ReferenceEnv:
 def open_reference(choice: Choice, checkpoint: Checkpoint, named: TaskSource | None, episodes: int) -> ReferenceEnv:
     """Build the environment that a policy was trained for, without observation noise, bias and delays.
 
-    It has as many parallel environments as the episodes need, even if the run has more.
+    If the run has more parallel environments than `episodes`, their number is reduced to `episodes`, but not below two.
 
     Args:
         choice: the policy that the user has chosen.
@@ -197,7 +197,7 @@ class _PlainMujocoRunner:
         self._closed = np.zeros(model.nu, dtype=bool)
         """Controls that a formula in the policy's metadata computes, by index of the control."""
         self._actuator_models = [(m, env.actuators[m["name"]]) for m in self._plan["actuator_models"] if m["closed"]]
-        """Actuator models with a formula in the metadata, and those of the environment."""
+        """Actuator models with a formula in the metadata: (record in the metadata, model of the environment) each."""
         self._random_gains: set[str] = set()
         """Names of the actuator models that had other gains than the formula in some environment."""
         try:
@@ -215,8 +215,8 @@ class _PlainMujocoRunner:
     def act(self, obs: Tensor) -> Tensor:
         """Return the actions of the exported policy for the states of plain MuJoCo. (num_envs, a)
 
-        The evaluation calls this function as its policy. `obs` are the environment's observations, with which those of
-        the generated program are compared. (num_envs, d)
+        The evaluation calls this function as its policy. `obs` are the environment's observations, with which the
+        observations of the generated program are compared. (num_envs, d)
         """
         is_first = (self._env.episode_length_buf == 0).tolist()
         for i, controller in enumerate(self._controllers):
@@ -272,12 +272,13 @@ class _PlainMujocoRunner:
     def _compute_actuator_models(self, commanded: np.ndarray, ctrl: np.ndarray, *, compare: bool) -> None:
         """Write the controls of the actuator models that have a formula to `commanded`, for the next physics step.
 
-        An environment with other gains than those of the formula keeps the controls of the environment's engine.
+        An environment whose gains differ from the gains in the formula keeps the controls of the environment's engine.
 
         Args:
             commanded: controls for plain MuJoCo; changed in place. (num_envs, nu)
             ctrl: controls that the environment computed. (num_envs, nu)
-            compare: whether to record the differences of the two; only if both sides have the same state.
+            compare: whether to record the differences between `commanded` and `ctrl`; only if both sides have the same
+                state.
         """
         for i, controller in enumerate(self._controllers if self._actuator_models else ()):
             computed = controller.controls(self._datas[i])
@@ -392,7 +393,7 @@ def _metadata_error(error: Exception) -> CheckpointError:
 def _control_bounds(controller: Any, model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
     """Return the smallest and the largest value that each control can have, (nu,) each.
 
-    They follow from MuJoCo's control ranges and from the limits of the policy's output `command`.
+    The limits follow from MuJoCo's control ranges and from the limits of the policy's output `command`.
     """
     limited = model.actuator_ctrllimited.astype(bool)
     low, high = (np.where(limited, end, far) for end, far in zip(model.actuator_ctrlrange.T, _FREE, strict=True))

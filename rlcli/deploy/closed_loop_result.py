@@ -40,7 +40,7 @@ class ClosedLoopResult:
     synchronized_return: float | None = None
     """Mean return with states re-synchronised after every step; None: not measured.
 
-    It is measured only if `plain_return` is too far from `evaluation_return` and all other checks pass.
+    This return is measured only if `plain_return` is too far from `evaluation_return` and all other checks pass.
     """
     disagreeing_steps: int = 0
     """Re-synchronised steps after which the states of the two sides differed by more than rounding."""

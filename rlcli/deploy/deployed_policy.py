@@ -19,7 +19,7 @@ class DeployedPolicy(nn.Module):
     """Policy with the input `obs` and the outputs `action` (argument of `env.step`) and `command` (for actuators).
 
     A recurrent policy also has the inputs `h_in` and `c_in` and the outputs `h_out` and `c_out`: hidden and cell state
-    of its layers, (layers, n, cells) float32 each. They are zeros when an episode begins.
+    of its layers, (layers, n, cells) float32 each. These states are zeros when an episode begins.
     """
 
     scale: Tensor

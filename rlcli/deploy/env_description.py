@@ -72,7 +72,7 @@ def _describe_managed(env: ManagedEnv) -> tuple[dict[str, Any], list[BoundTerm]]
 def _describe_direct(env: DirectEnv) -> tuple[dict[str, Any], list[BoundTerm]]:
     """Return the observations of a direct task as JSON data, by group, and its actions as terms.
 
-    A direct task has formulas, and actions as terms, only if its method `in_terms` writes it as terms of `rlcli.mdp`.
+    A direct task has formulas, and actions as terms, only if its method `in_terms` returns terms of `rlcli.mdp`.
     """
     task, in_terms = env.task, env.task.in_terms()
     groups = {

@@ -78,7 +78,7 @@ def check_target(format_: str, output: Path | None) -> None:
 
 
 def _export_obstacle(spec: PolicySpec) -> str | None:
-    """Return why a policy cannot be exported, as the end of `its policy has ...`; None if it can be exported."""
+    """Return why a policy cannot be exported, as the end of `its policy has ...`; None if there is no obstacle."""
     if len(set(spec.memory)) > 1:
         return f"recurrent layers of different sizes ({', '.join(map(str, spec.memory))})"
     return None
@@ -168,8 +168,8 @@ def _require_equal(run: PolicyFunction, graph: DeployedPolicy, observations: Ten
                 difference = relative_difference(found[name], values)
                 if found[name].shape != values.shape or not bool((difference <= TOLERANCE).all()):
                     raise VerdictError(
-                        f"{file} was not kept: with batch size {batch} its output '{name}' differs from the policy's"
-                        f" by a relative {float(difference.max()):.3g}; at most {TOLERANCE:g} is allowed",
+                        f"{file} was not kept: with batch size {batch}, file and policy have outputs '{name}' with the"
+                        f" relative difference {float(difference.max()):.3g}; at most {TOLERANCE:g} is allowed",
                         hint="report this bug with the versions of torch, onnx and onnxruntime",
                     )
                 worst = max(worst, float(difference.max()))

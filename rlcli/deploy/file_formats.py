@@ -1,6 +1,6 @@
 """Writers of the file formats of exported policies (ONNX, torch, numpy), and readers that check the written files.
 
-`rlcli.deploy.export` calls them.
+`rlcli.deploy.export` calls this module.
 """
 
 import contextlib

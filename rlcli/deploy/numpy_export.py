@@ -46,7 +46,7 @@ def numpy_bytes(graph: DeployedPolicy, metadata: str) -> bytes:
 def read_numpy(file: Path) -> tuple[Any, str]:
     """Execute an exported Python file; return the policy as a `PolicyFunction`, and the metadata as JSON text.
 
-    Call it only with a file that this process has written.
+    Call this function only with a file that this process has written.
     """
     space: dict[str, Any] = {"__name__": "policy"}
     exec(compile(file.read_text(encoding="utf-8"), str(file), "exec"), space)

@@ -1,4 +1,4 @@
-"""Checks of torch, MuJoCo, OpenGL and GPU drivers; they run in separate processes because they may hang or crash."""
+"""Checks of torch, MuJoCo, OpenGL and GPU drivers, in separate processes, because a check may hang or crash."""
 
 import contextlib
 import json

@@ -139,7 +139,7 @@ def harmful_variables(variables: dict[str, str], cores: int) -> dict[str, str]:
         found["OMP_THREAD_LIMIT"] = "fewer threads than the default of agent.torch_threads"
     for name, spinning in (("OMP_WAIT_POLICY", "active"), ("KMP_BLOCKTIME", "infinite")):
         if variables.get(name, "").strip().lower() == spinning:
-            found[name] = "waiting OpenMP threads occupy cores that the engine needs; unset it"
+            found[name] = "waiting OpenMP threads occupy cores that the engine needs"
     if variables.get("LOCAL_WORLD_SIZE", "1") not in ("", "1"):
         found["LOCAL_WORLD_SIZE"] = "rlcli divides the cores by this number, which launchers of several processes set"
     return found

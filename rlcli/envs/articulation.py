@@ -1,6 +1,6 @@
 """Class `ArticulationView`: the robots of all environments as tensors, with the method names of OmniIsaacGymEnvs.
 
-Direct tasks that were written for OmniIsaacGymEnvs read and set joint states with it.
+Direct tasks that were written for OmniIsaacGymEnvs read and set joint states with this class.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Counters of the environment loop: steps, episodes, and steps in which the conditions of success hold.
 
-`VecEnv` updates them in every step; checkpoints contain them.
+`VecEnv` updates the counters in every step; checkpoints contain the counters.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Program that loads plugins and describes them; `rlcli list-tasks` runs it in a separate process.
+"""Program that loads plugins and writes descriptions; `rlcli list-tasks` runs this program in a separate process.
 
 `python -m rlcli.envs.describe_plugins GROUP FILE NAME...` appends a line of JSON to FILE for each named task, trainer
 or format. `--index DISTRIBUTION` prints the `index.json` that a distribution ships for `list-tasks`.

@@ -134,7 +134,7 @@ class DirectTask:
 
         `observations` and `actions` are lists of terms like those of a YAML (`func`, its parameters, `scale`, `clip`),
         in the order of the columns, before `clip_observations` and after `clip_actions`. None: the task cannot be
-        described by such terms. `rlcli export --verify` compares their values with those of the hooks.
+        described by such terms. `rlcli export --verify` compares the values of the terms with those of the hooks.
         """
         return None
 
@@ -165,7 +165,7 @@ class DirectEnv(VecEnv):
     """Environment of a `DirectTask`."""
 
     not_recorded: ClassVar[str | None] = None
-    """Reason why a step of this class cannot be captured in a CUDA graph; None: it can be captured."""
+    """Reason why a step of this class cannot be captured in a CUDA graph; None: there is no obstacle."""
 
     def _prepare_scene(self, scene: Scene) -> None:
         task_class = self._task_class()
@@ -191,7 +191,7 @@ class DirectEnv(VecEnv):
             raise TaskError(message) from error
         if not (isinstance(task_class, type) and issubclass(task_class, DirectTask)):
             raise TaskError(
-                f"task '{source.name}' is broken: {source.task} is not a DirectTask; derive it from DirectTask"
+                f"task '{source.name}' is broken: {source.task} is no subclass of DirectTask; derive the class from DirectTask"
             )
         return task_class
 
@@ -422,7 +422,7 @@ class DirectEnv(VecEnv):
 
 
 _BUFFERS = ("obs_buf", "states_buf", "rew_buf", "reset_buf", "progress_buf")
-"""Buffers that the environment loop reads. Their shapes are checked on load; those of other attributes may change."""
+"""Buffers that the environment loop reads. Only their shapes are checked when a checkpoint is loaded."""
 
 
 def _symmetric(bound: float | None) -> tuple[float, float] | None:

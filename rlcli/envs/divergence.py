@@ -97,8 +97,9 @@ class DivergenceGuard:
     def quarantine_out_of_bounds(self) -> None:
         """Quarantine the environments that an event or a reset has put out of bounds.
 
-        They return to the state before the event, or to the default state if their episode has just begun; the next
-        step ends their episode. On a GPU the next step finds these environments: a check here would force a host sync.
+        These environments return to the state before the event, or to the default state if their episode has just
+        begun; the next step ends their episode. On a GPU the next step finds these environments: a check here would
+        force a host sync.
         """
         env = self._env
         if env.engine.asynchronous:

@@ -96,7 +96,7 @@ class Environment(Protocol):
         """Return where all conditions of success hold in the current state; None without conditions. (num_envs,)"""
 
     def check(self) -> None:
-        """Raise the pending `DivergedError` of the steps since the last call. On a CPU `step` has already raised it."""
+        """Raise the pending `DivergedError` of the steps since the last call; on a CPU, `step` has raised the error."""
 
     @property
     def common_step(self) -> int:
@@ -124,15 +124,15 @@ class Environment(Protocol):
     def extras(self) -> dict[str, float]:
         """Return the values to log, by the names of the metrics.
 
-        They are the means of a direct task's `extras` or of the curriculum's values, and the number of divergences
-        since the last call, by cause.
+        The values are the means of a direct task's `extras` or of the curriculum's values, and the number of
+        divergences since the last call, by cause.
         """
 
     def step_metrics(self) -> dict[str, Tensor]:
         """Return the values that a direct task wrote to `extras` in this step, by name. (num_envs,) each
 
-        They describe the state before resets; evaluations and `StepObserver.on_step` read them. The metrics of command
-        terms are in `Episodes.metrics`.
+        The values describe the state before resets; evaluations and `StepObserver.on_step` read them. The metrics of
+        command terms are in `Episodes.metrics`.
         """
 
     def reset_metrics(self) -> dict[str, Tensor]:

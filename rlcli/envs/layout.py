@@ -23,7 +23,7 @@ class TermLayout:
     scale: tuple[float, ...] | None = None
     """Factor of each column; None: no scale, or the task's own code scales the action."""
     clip: tuple[float, float] | tuple[tuple[float, float], ...] | None = None
-    """Limits of the columns.
+    """Limits of the columns; None: no limits.
 
     Observation: one pair for all columns, before the scale. Action: a pair for each column, after scale and offset.
     """
@@ -102,5 +102,5 @@ class Layout:
 
 
 def _finite_pairs(pairs: tuple[tuple[float, float], ...] | None) -> list[list[float | None]] | None:
-    """Return (low, high) pairs as lists, with None for infinity, which JSON does not have; None if there are none."""
+    """Return (low, high) pairs as lists, with None for infinity, which JSON does not have; None without pairs."""
     return [[x if math.isfinite(x) else None for x in pair] for pair in pairs or ()] or None

@@ -249,7 +249,7 @@ class _MirrorTest:
     def _term_map(self, name: str, pipeline: Pipeline, own: Tensor, images: Tensor) -> list[tuple[int, float]]:
         """Return, for each column of a term, (index, sign): column i of the image is `sign` x column `index`."""
         if len(pipeline.shape) > 1:
-            raise TaskError(f"observation '{name}' is an image, which has no mirror map; remove it from the group")
+            raise TaskError(f"observation '{name}' is an image and has no mirror map; remove the image from the group")
         rays = _ray_partners(pipeline)
         if rays is not None:
             return [(partner, 1.0) for partner in rays]
@@ -258,8 +258,8 @@ class _MirrorTest:
             place = f"column {column} of observation '{name}'"
             if image.max() == image.min():
                 raise TaskError(
-                    f"the sign of {place} in the mirror is unknown: it is {float(image[0]):g} in all tested states;"
-                    " remove the column, or make its value vary"
+                    f"the sign of {place} in the mirror is unknown: its value is {float(image[0]):g} in all tested"
+                    " states; remove the column, or make its value vary"
                 )
             errors = torch.stack([_relative(image[:, None] - s * own, image[:, None].expand_as(own)) for s in (1, -1)])
             fits = (errors <= self._tolerance).nonzero().tolist()

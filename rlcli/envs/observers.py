@@ -1,6 +1,6 @@
 """Base class and registry of observers, which the environment loop calls at fixed points of each step.
 
-Recorders, crash dumps and statistics of evaluations are observers. Most of them only read.
+Recorders, crash dumps and statistics of evaluations are observers. Most observers only read.
 """
 
 from __future__ import annotations

@@ -110,7 +110,8 @@ class VecEnv(Workflow):
         self.env_origins = grid(distinct, self.config.scene.env_spacing).to(self.device)[streams]
         """Position of each environment on a grid. (num_envs, 3) [m]
 
-        Task formats of other frameworks need it, in which all environments are in one world, side by side."""
+        In task formats of other frameworks all environments are in one world, side by side; these formats need the
+        positions."""
         self._counters.attach(self.engine)
         self._bind_terms()
         success = self._binder.bind_all("success")
@@ -311,7 +312,7 @@ class VecEnv(Workflow):
         return functools.reduce(torch.logical_and, held) if held else None
 
     def check(self) -> None:
-        """Raise the pending `DivergedError` of the steps since the last call. On a CPU `step` has already raised it."""
+        """Raise the pending `DivergedError` of the steps since the last call; on a CPU, `step` has raised the error."""
         self._guard.check()
 
     @property

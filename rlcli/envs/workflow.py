@@ -105,7 +105,7 @@ class Workflow(Environment):
     def metric_values(self) -> dict[str, Tensor]:
         """Return the tensors of the newest step whose means are logged, by name; they may have any shape.
 
-        They are the `extras` of a direct task, or the values of the curriculum.
+        The tensors are the `extras` of a direct task, or the values of the curriculum.
         """
         return {}
 
@@ -128,8 +128,8 @@ class Workflow(Environment):
     def step_metrics(self) -> dict[str, Tensor]:
         """Return the values that a direct task wrote to `extras` in this step, by name. (num_envs,) each
 
-        They describe the state before resets; evaluations and `StepObserver.on_step` read them. The metrics of command
-        terms are in `Episodes.metrics`.
+        The values describe the state before resets; evaluations and `StepObserver.on_step` read them. The metrics of
+        command terms are in `Episodes.metrics`.
         """
         return {}
 

@@ -64,7 +64,7 @@ class Limit:
         return value
 
     def failure(self, summary: Mapping[str, Any]) -> str | None:
-        """Return the sentence that says why an evaluation fails this limit; None if it does not fail."""
+        """Return the sentence that says why an evaluation fails this limit; None if the evaluation passes."""
         value = self.value_in(summary)
         if value is None:
             return (

@@ -1,8 +1,9 @@
 """Linear-quadratic regulator (LQR) of a task at its default state, a reference for trained policies.
 
-The linear model is identified from the environment: one step from each of many states near the default one, with small
-actions. The regulator uses the policy's observations and actions. A task has no regulator if its default state is not
-an equilibrium, if the observations do not determine the state, or if no linear feedback stabilizes the default state.
+The linear model is identified from the environment: one step from each of many states near the default state, with
+small actions. The regulator uses the policy's observations and actions. A task has no regulator if its default state is
+not an equilibrium, if the observations do not determine the state, or if no linear feedback stabilizes the default
+state.
 """
 
 import contextlib
@@ -100,7 +101,7 @@ def regulator(resolved: Resolved, bound: float | None) -> Regulator:
     gain = riccati(a, b, np.eye(nx), np.eye(b.shape[1]) / (bound or 1.0) ** 2)
     poles = tuple(sorted(np.abs(np.linalg.eigvals(a - b @ gain)).tolist(), reverse=True)) if gain is not None else ()
     if gain is None or poles[0] >= 1.0:
-        raise _no_regulator_error(resolved, "no linear feedback stabilises its default state")
+        raise _no_regulator_error(resolved, "no linear feedback stabilizes its default state")
     return Regulator(gain @ decoder.T, rest, bound, poles)
 
 

@@ -297,7 +297,7 @@ class ModelPerturbation:
         """Perturb the model values that the task has written since the last call of `note_values`.
 
         Returns:
-            Whether each environment was changed, (num_envs,) bool; None if none was.
+            Whether each environment was changed, (num_envs,) bool; None if no environment was changed.
         """
         written = [part.written() & self._affected[:, None] for part in self._parts]
         rows = torch.stack([mask.any(dim=1) for mask in written]).any(dim=0)

@@ -149,7 +149,7 @@ def named_task_or_run(task: str, runs_dir: Path | None) -> TaskSource:
 
     Args:
         task: name, file or folder of a task.
-        runs_dir: folder in which to look for a run with this name; None: the default one.
+        runs_dir: folder in which to look for a run with this name; None: the default folder of runs.
 
     Raises:
         TaskError: if there is no such task.

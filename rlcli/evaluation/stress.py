@@ -79,7 +79,11 @@ class StressResult:
         return found
 
     def record(self, against: str | None) -> dict[str, Any]:
-        """Return the result as data for JSON; `against` is the kind of the reference policy, None without one."""
+        """Return the result as data for JSON.
+
+        Args:
+            against: kind of the reference policy (lqr, zero, random); None: there is no reference policy.
+        """
         worst = self.worst
         reference = {point: summary for point, summary in self.reference.items() if point is not None}
         return {

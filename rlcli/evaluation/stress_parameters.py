@@ -24,7 +24,7 @@ PHYSICAL = {
     "effort_limit": "actuator_forcerange",
     "gravity": "opt.gravity",
 }
-"""Parameter with a name of its own -> field of MjModel that it changes; other MjModel fields are parameters, too."""
+"""Name of a parameter -> field of MjModel that the parameter changes. Other fields can be named directly."""
 SIGNALS = {
     "action_delay": "control steps",
     "action_noise": "standard deviation, in the units of the policy's actions",

@@ -10,8 +10,8 @@ _saved_thresholds: list[tuple[int, int, int]] = []
 def delay_garbage_collection() -> None:
     """Make Python's cyclic garbage collection rare until `restore_garbage_collection` is called.
 
-    The command line calls it at its start. Imports create hundreds of thousands of objects that stay in memory;
-    scanning them again and again takes a fifth of the time of importing torch.
+    The command line calls this function at its start. Imports create hundreds of thousands of objects that stay in
+    memory; to scan these objects again and again takes a fifth of the time of importing torch.
     """
     _saved_thresholds.append(gc.get_threshold())
     gc.set_threshold(*_SELDOM)

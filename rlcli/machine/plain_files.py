@@ -1,4 +1,4 @@
-"""Reading of files that never blocks on a device or an empty pipe."""
+"""Function that reads a regular file, and never blocks on a device or an empty pipe."""
 
 import errno
 import os

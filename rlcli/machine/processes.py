@@ -1,4 +1,4 @@
-"""Command line of Python subprocesses, and environment variables of processes: launchers' numbers, OpenMP settings."""
+"""Helpers for processes: command of a Python subprocess, numbers set by launchers such as torchrun, OpenMP setting."""
 
 import os
 import sys
@@ -8,7 +8,7 @@ from rlcli.safe_text import read_number
 
 
 def python_command(*arguments: str) -> list[str]:
-    """Return the command that starts this Python with arguments. It cannot import files of the current folder."""
+    """Return the command that starts this Python with arguments, and with `-P`: no imports from the current folder."""
     return [sys.executable, "-P", *arguments]
 
 

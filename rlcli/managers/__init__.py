@@ -1,1 +1,1 @@
-"""Managers of manager-based tasks. Each calls the terms (functions and classes) of one section of the YAML."""
+"""Managers of manager-based tasks. Each manager calls the terms (functions, classes) of one section of the YAML."""

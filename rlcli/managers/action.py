@@ -109,7 +109,7 @@ class ActionManager(TensorState):
 
 
 def _require_separate_actuators(terms: list[BoundTerm]) -> None:
-    """Check that no two terms write to the same actuator: the later one would overwrite the earlier.
+    """Check that no two terms write to the same actuator: the later term would overwrite the controls of the earlier.
 
     Raises:
         ConfigError: with both terms and the element that they share.

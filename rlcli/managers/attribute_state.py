@@ -1,8 +1,8 @@
 """State of a task's own objects: attributes that change from step to step, saved in checkpoints and restored.
 
-Tensors, arrays and torch generators are always saved, also in dicts, lists and tuples. Plain values, containers of them
-and other random generators are saved only after they have changed. Other attributes that may change cannot be saved;
-`AttributeState.unsaved` lists them.
+Tensors, arrays and torch generators are always saved, also in dicts, lists and tuples. Plain values, containers of
+plain values and other random generators are saved only after they have changed. Other attributes that may change cannot
+be saved; `AttributeState.unsaved` lists these attributes.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ class NotSerializableError(TypeError):
 
 
 class AttributeState:
-    """Saver of an object's attributes, and of those of its helpers: attributes that are objects of the task's classes.
+    """Saver of the attributes of an object of a task, and of the objects of the task's classes among these attributes.
 
     Args:
-        owner: the object. Make the saver before the first step: a value counts as changed if it differs from the value
-            at that time.
+        owner: the object. Create the saver before the first step: a value counts as changed if it differs from the
+            value at that time.
         excluded: names of attributes that are not saved.
     """
 

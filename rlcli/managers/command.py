@@ -35,13 +35,13 @@ class CommandTerm(Protocol):
     - `elements` has the names of the columns of `command` that a user may set ("" for other columns), `limits` their
       usual [low, high], and `units` their units.
     - `mirror_signs` has +1 or -1 for each column: the command times these signs is the command of the robot's mirror
-      image about its x-z plane. The agent's key `symmetry` needs it.
+      image about its x-z plane. The agent's key `symmetry` needs these signs.
 
     `markers() -> list[Marker]` returns the command as arrows, spheres and frames (`rlcli.sim.markers`): positions in
-    the world frame (num_envs, 3) [m], like `entity.data.root_pos_w`, and quaternions (w, x, y, z), (num_envs, 4). It is
-    called once for each image, never in a step, and must change nothing. It may read the state of roots and joints, and
-    the fields that `metrics` or `update` read: a first read of another field makes the engine compute that field in
-    each step.
+    the world frame (num_envs, 3) [m], like `entity.data.root_pos_w`, and quaternions (w, x, y, z), (num_envs, 4).
+    `markers` is called once for each image, never in a step, and must change nothing. It may read the state of roots
+    and joints, and the fields that `metrics` or `update` read: a first read of another field makes the engine compute
+    that field in each step.
     """
 
     command: Tensor

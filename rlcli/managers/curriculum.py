@@ -15,10 +15,10 @@ from rlcli.sim.saved_tensors import TensorState, mean_of
 class CurriculumManager(TensorState):
     """Manager of the curriculum terms.
 
-    A term is a function `name(env, selection, *, ...)` or a class. It is called with the environments whose episode
-    ends, before they are reset. A class may have a method `advance(step)` instead, which is called once in each step
-    with the number of steps so far, so that a schedule does not depend on resets. A call or `advance` may return a
-    value to log, a number or a tensor (num_envs,); the mean of the tensor is logged.
+    A term is a function `name(env, selection, *, ...)` or a class. The manager calls a term with the environments whose
+    episode ends, before these environments are reset. A class may have a method `advance(step)` instead, which is
+    called once in each step with the number of steps so far, so that a schedule does not depend on resets. A call or
+    `advance` may return a value to log, a number or a tensor (num_envs,); the mean of the tensor is logged.
     """
 
     def __init__(self, terms: list[BoundTerm], context: EnvContext) -> None:

@@ -1,4 +1,7 @@
-"""Manager of the observation groups. A pipeline of operations (noise, scale, delay, ...) changes each term's value."""
+"""Manager of the observation groups (vectors of term values for the policy, the critic and so on).
+
+A pipeline of operations (noise, scale, delay, ...) changes the value of each term.
+"""
 
 from __future__ import annotations
 
@@ -117,7 +120,7 @@ class ObservationManager(TensorState):
         return self.groups[group].pipelines
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return the tensors to save: those of the pipelines, and the last observations of groups with a history."""
+        """Return the tensors to save: the tensors of the pipelines, and last observations of groups with a history."""
         tensors = {
             f"{name}.{pipeline.term.name}.{key}": tensor
             for name, group in self.groups.items()

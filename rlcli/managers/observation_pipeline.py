@@ -124,8 +124,8 @@ class Pipeline:
         Args:
             view: columns of the term in the observations. (num_envs, size)
             rows: the environments, and their random numbers.
-            salt: number that changes the random streams (by xor), so that final observations have other random numbers
-                than ordinary ones.
+            salt: number that changes the random streams (by xor), so that final observations and ordinary observations
+                have different random numbers.
         """
         value = rows.read(self._read().reshape(view.shape)).float()
         for stage in self._stages:
@@ -215,7 +215,7 @@ class _Constant(Stage):
 
 
 class _Bias(_Constant):
-    """Addition of a bias (or scaling by it, ...) that is sampled once for each episode."""
+    """Bias that is sampled once for each episode, and added to the value (or multiplied with it, ...) in each step."""
 
     def __init__(self, sampler: Sampler, operation: str, stream: np.uint64, bias: Tensor) -> None:
         super().__init__(operation, bias)

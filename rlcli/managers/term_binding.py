@@ -1,7 +1,7 @@
 """Binding of terms to the compiled model, when the environment is built.
 
-To bind a term is to create it from its configuration: the names in its parameters, such as those of entities and
-joints, are replaced by objects and indices, and the result is a `BoundTerm`.
+To bind a term is to create it from its configuration: names of entities, joints and so on in its parameters are
+replaced by objects and indices, and the result is a `BoundTerm`.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ SENSORS = {"ContactSensor": "contact", "RaySensor": "rays", "CameraSensor": "cam
 class BoundTerm:
     """Configured term whose parameters are objects and indices instead of names.
 
-    A manager gets the term's value by `call()`; it runs an event or a curriculum term by `call(selection)`.
+    A manager gets the term's value by `call()`, and runs an event or a curriculum term by `call(selection)`.
     """
 
     name: str
@@ -72,7 +72,7 @@ class BoundTerm:
         """Check that values of the term are finite; `what` is their name in the message. values (num_envs, ...)
 
         Raises:
-            DivergedError: with the number of environments and the first of them.
+            DivergedError: with the number of environments that have a value that is not finite, and the first of them.
         """
         bad = ~values.isfinite().flatten(1).all(dim=1) if values.dim() > 1 else ~values.isfinite()
         if bool(bad.any()):
@@ -128,7 +128,7 @@ class TermEnv(Protocol):
 
 
 class Binder:
-    """Resolver of the names in the terms of one environment. It collects problems, and raises all of them at once."""
+    """Resolver of the names in the terms of one environment; problems are collected, and raised all at once."""
 
     def __init__(self, env: TermEnv, resolved: Resolved) -> None:
         self.env = env
@@ -318,7 +318,7 @@ class CheckedTerm:
         term: the term.
         value: the first value of the term.
         shape: the shape that each value must have.
-        is_mask: whether the values are truth values, as those of terminations are.
+        is_mask: whether the values are truth values, such as the values of terminations.
 
     Raises:
         ShapeError: if the first value is wrong. A call raises a ShapeError for a later value that is wrong.

@@ -253,8 +253,9 @@ class UniformPose(EntityTerm):
 class ReachablePosition(EntityTerm):
     """Position that a body of a robot with a fixed base can reach, in the root's frame [m]. (num_envs, 3)
 
-    The positions are those of the body at 2,048 random positions of `joints`, without poses in which links touch each
-    other or the scene. position: range of the offset from the default joint position [m or rad]; joint limits count.
+    The positions are positions of the body at 2,048 random positions of `joints`, without poses in which links touch
+    each other or the scene. position: range of the offset from the default joint position [m or rad]; joint limits
+    apply.
     """
 
     elements = ("x", "y", "z")

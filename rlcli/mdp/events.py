@@ -1,4 +1,4 @@
-"""Event terms. Each changes the environments of a `Selection`, which also draws random numbers for them.
+"""Event terms. Each term changes the environments of a `Selection`, which also draws the random numbers.
 
 The random numbers depend only on the seed, the term, the environment and the index of its episode. The random numbers
 of interval events depend on the training step instead of the episode.
@@ -81,7 +81,7 @@ def reset_joints_by_gaussian(
 class ResetJointsWithinLimits(JointTerm):
     """Reset of joints to uniform positions between their soft limits, and to uniform velocities [m/s or rad/s].
 
-    position: range of the position as a fraction of the way from the lower limit (0) to the upper one (1).
+    position: range of the position as a fraction of the way from the lower limit (0) to the upper limit (1).
     """
 
     position: Range = (0.0, 1.0)

@@ -212,7 +212,7 @@ def remaining_time_s(env: ManagedEnv) -> Tensor:
 def sensor_data(env: ManagedEnv, *, entity: Entity = "robot", sensors: Sensors) -> Tensor:
     """Sensor readings, one after the other, each in its own unit, of sensors in the MJCF. (num_envs, k)
 
-    Forces and accelerations are those of the last substep. mjlab: `builtin_sensor`.
+    Forces and accelerations belong to the last substep (physics step). mjlab: `builtin_sensor`.
     """
     return entity.data.sensordata[:, sensors]
 

@@ -18,7 +18,7 @@ from rlcli.task import ContactSensor, Entity, Sites
 
 
 def constant(values: Sequence[float] | Tensor, device: torch.device) -> Tensor:
-    """Return numbers of the configuration as a tensor, which is cached: a CUDA graph cannot create tensors."""
+    """Return numbers of the configuration as a cached tensor: a step captured as a CUDA graph cannot create tensors."""
     return values if isinstance(values, Tensor) else _constant(tuple(values), device)
 
 

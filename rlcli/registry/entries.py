@@ -1,6 +1,6 @@
-"""Search for plugins: the entry points of installed distributions, read without importing any of them.
+"""Search for plugins: the entry points of installed distributions, read without importing a distribution.
 
-Distributions are read one by one, so that a broken one does not hide the others.
+Distributions are read one by one, so that a broken distribution does not hide the others.
 """
 
 import contextlib

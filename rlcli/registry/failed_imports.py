@@ -1,6 +1,6 @@
 """Placeholders for modules whose import failed in a package that registers several tasks.
 
-With a placeholder, the other tasks of the package can still be used. Its use raises the error of the failed import.
+With placeholders, the other tasks of the package can be used. Any use of a placeholder raises the import's error.
 """
 
 import logging

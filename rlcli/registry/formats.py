@@ -49,7 +49,7 @@ class Format:
         return load_entry(replace(self.entry, value=reference), object)
 
     def call(self, part: str, *arguments: Any) -> Any:
-        """Call a function of the format; return None if the format does not have it. A generator is read to its end.
+        """Call a function of the format; return None if the format lacks the function. A generator is read to its end.
 
         Args:
             part: the attribute of the `FormatSpec` that names the function, such as `find`.
@@ -160,7 +160,7 @@ def usable_formats() -> Iterator[Format]:
 
 
 def find_in_formats(path: Path) -> TaskSource | None:
-    """Return the task of a folder or file in an installed format; None if no working format recognises it."""
+    """Return the task of a folder or file in an installed format; None if no working format recognises the path."""
     source: TaskSource | None = first_result("find", path)
     return source
 

@@ -173,7 +173,8 @@ _BUILT_IN = builtins.__dict__
 def _restore_built_in(before: dict[str, Any], is_callable: Callable[[object], bool] = callable) -> None:
     """Restore the built-in functions that a plugin deleted or replaced by a value that cannot be called.
 
-    Before they are restored, this function must not call any built-in function; `is_callable` is bound early for this.
+    Until the functions are restored, this function must not call a built-in function by name: `is_callable` is an
+    argument for this reason.
 
     Args:
         before: name -> object of the module `builtins` before the plugin's code ran.

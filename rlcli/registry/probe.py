@@ -52,7 +52,7 @@ class Details:
     policy: bool = False
     """Whether a trained policy is shipped with the task."""
     broken: str | None = None
-    """Why the task cannot be loaded; None: it can be loaded, or it has not been probed."""
+    """Why the task cannot be loaded; None: the task can be loaded, or has not been probed."""
     remedy: str | None = None
     """How the user provides the model that a broken task needs; None if nothing is missing."""
 
@@ -76,7 +76,7 @@ _TYPES: dict[str, Any] = {
     "summary": str,
     "policy": bool,
 }
-"""Types of the fields of `Details`. They are checked by hand: importing pydantic would slow `list-tasks` down."""
+"""Types of the fields of `Details`. `_parse_details` checks them, because an import of pydantic would be slow."""
 
 
 def cached_details(entries: Iterable[Entry]) -> dict[str, Details]:

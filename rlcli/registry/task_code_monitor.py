@@ -122,8 +122,8 @@ def _libraries() -> list[Path]:
 def observe_task_code() -> Iterator[None]:
     """Report what the code of tasks and plugins does in the `with` block, each as one warning in rlcli's log.
 
-    These are its warnings, records of its loggers without a handler, errors in its threads and destructors, and calls
-    that have not returned after `SLOW_S`. Each line of code is reported once.
+    Reported are warnings of this code, records of its loggers without a handler, errors in its threads and destructors,
+    and calls that have not returned after `SLOW_S`. Each line of code is reported once.
     """
     # an earlier command of this process may have filled these caches
     for function in (warn_once, is_task_file, _plugins):
@@ -347,8 +347,12 @@ class _Watch(threading.Thread):
         place = f"{call.f_code.co_filename}:{call.f_lineno}: "
         if entry is not None:
             place = f"plugin {entry.distribution} {entry.version}: {place}"
-            advice = "; if it does not end, exclude the plugin with RLCLI_PLUGINS=none"
-        at = "" if inner is call else f"; it is at {inner.f_code.co_filename}:{inner.f_lineno}, {inner.f_code.co_name}"
+            advice = "; if the call does not end, exclude the plugin with RLCLI_PLUGINS=none"
+        at = (
+            ""
+            if inner is call
+            else f"; the call is at {inner.f_code.co_filename}:{inner.f_lineno}, {inner.f_code.co_name}"
+        )
         warn_once(f"{place}{call.f_code.co_name} has not returned for {SLOW_S:g} s{at}{advice}")
 
 

@@ -54,7 +54,7 @@ class TaskSource:
 
     @property
     def without_terms_hint(self) -> str:
-        """First part of the hint for an unknown term: why a task in YAML has no own terms; empty if it has some."""
+        """First part of the hint for an unknown term: why a task in YAML has no own terms; else empty."""
         if self.term_files or self.python is not None or self.value is not None:
             return ""
         if self.distribution is None:

@@ -105,16 +105,16 @@ TYPOS = [
     ("play=3", "play: expected a mapping, found 3", None),
     ("play.play={}", "play.play: 'play' belongs at the top level; remove it here", None),
     ("decimation.x=1", "'decimation' is a single value; leave out the keys after it", None),
-    ("dt=1", "dt: unknown key 'dt'", "it belongs in sim (sim.dt)"),
-    ("num_envs=1", "num_envs: unknown key", "it belongs in scene (scene.num_envs)"),
-    ("gamma=1", "gamma: unknown key", "it belongs in agent (agent.gamma)"),
-    ("sim.decimation=1", "sim.decimation: unknown key", "it belongs at the top level"),
+    ("dt=1", "dt: unknown key 'dt'", "the key belongs in sim (sim.dt)"),
+    ("num_envs=1", "num_envs: unknown key", "the key belongs in scene (scene.num_envs)"),
+    ("gamma=1", "gamma: unknown key", "the key belongs in agent (agent.gamma)"),
+    ("sim.decimation=1", "sim.decimation: unknown key", "the key belongs at the top level"),
     (
         "agent.eval_episodes=1000000000",
         "agents.one.eval_episodes: expected a whole number <= 1000000, found 1000000000",
         None,
     ),
-    ("agent.num_envs=1", "agents.one.num_envs: unknown key", "it belongs in scene (scene.num_envs)"),
+    ("agent.num_envs=1", "agents.one.num_envs: unknown key", "the key belongs in scene (scene.num_envs)"),
     ("scene.entities.robot.kp=1", "unknown key 'kp'", "scene.entities.NAME.joints.NAME"),
 ]
 

@@ -201,7 +201,7 @@ WARP = {"version": "1.19.0", "devices": ["H200"], "error": ""}
         (
             {"torch_error": ": no kernel image"},
             "warning",
-            "cannot compute on it: no kernel image",
+            "cannot compute on this GPU: no kernel image",
             "built for this GPU",
         ),
         ({"warp": None}, "warning", "warp-lang is not installed", pip_install("rlcli[gpu]")),

@@ -223,7 +223,9 @@ def test_plugin_that_hangs_is_named(plugins, flags, named):
         process.kill()
     assert any(line.startswith(named) for line in lines), lines
     if flags:
-        assert "slow/__init__.py:2: <module> has not returned for 10 s; if it does not end, exclude the" in lines[0]
+        assert (
+            "slow/__init__.py:2: <module> has not returned for 10 s; if the call does not end, exclude the" in lines[0]
+        )
 
 
 @pytest.mark.slow

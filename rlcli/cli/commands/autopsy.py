@@ -64,7 +64,7 @@ def command(
     if video is not None and case is None:
         raise UsageError(
             "--video needs the number of a recorded episode",
-            hint="rlcli autopsy RUN lists them; rlcli autopsy RUN N --video FILE.mp4",
+            hint="rlcli autopsy RUN lists the episodes; rlcli autopsy RUN N --video FILE.mp4 renders one",
         )
     video = video_file(video, "autopsy.mp4")
     from rlcli.replay.failure_cases import list_failure_cases, why_no_cases

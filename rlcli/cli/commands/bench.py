@@ -1,6 +1,6 @@
 """Command `rlcli bench`: measurement of a task's speed on this machine.
 
-It recommends numbers of environments, threads and worker processes, and can write them to a file for `--config`.
+The command recommends numbers of environments, threads and worker processes; --save-preset writes them to a file.
 """
 
 from __future__ import annotations

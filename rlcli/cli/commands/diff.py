@@ -191,5 +191,5 @@ def _require_step(run: Run, step: int) -> None:
     if step not in have:
         raise CheckpointError(
             f"{run.folder} has no checkpoint at step {step}",
-            hint=f"it has checkpoints at these steps: {listing(map(str, have))}",
+            hint=f"the run has checkpoints at these steps: {listing(map(str, have))}",
         )

@@ -1,6 +1,7 @@
 """Command `rlcli eval`: evaluation of a policy over many episodes, or comparison of several policies.
 
-It prints means and rates with confidence intervals, and fails if a limit such as `--fail-under` is missed.
+The command prints means and rates with confidence intervals. It fails with exit code 9 if a limit such as
+`--fail-under` is missed.
 """
 
 from __future__ import annotations

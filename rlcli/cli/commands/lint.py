@@ -1,7 +1,7 @@
-"""Command `rlcli lint`: search for properties of a task that make it hard to learn.
+"""Command `rlcli lint`: search for properties of a task that make learning hard, such as a reward that never changes.
 
-The linter runs simple fixed policies (zero, random, bang-bang, sine). Each of its rules searches their rollouts for one
-such property. `rlcli.testing.lint_rules.RULES` contains all rules.
+The linter runs simple fixed policies (zero, random, bang-bang, sine). Each rule searches the rollouts of these policies
+for one property. `rlcli.testing.lint_rules.RULES` contains all rules.
 """
 
 from typing import TYPE_CHECKING, Annotated

@@ -70,6 +70,6 @@ def _print_design(design: "RobotTask") -> None:
     if not design.has_pose:
         console.warn(
             "no keyframe: the default pose is zero joint angles, except where a limit is near or beyond zero; to change"
-            " it, set scene.entities.robot.init.joint_pos in task.yaml, and the height in scene.entities.robot.pos"
+            " the pose, set scene.entities.robot.init.joint_pos in task.yaml; for the height, scene.entities.robot.pos"
         )
     console.info(f"task: {design.kind}, because {design.reason}")

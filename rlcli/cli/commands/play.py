@@ -1,6 +1,6 @@
 """Command `rlcli play`: run a policy and show it in a window, in the browser, in a video, or as printed values.
 
-It can also repeat one episode of an evaluation, and record episodes to a file.
+The command can also repeat one episode of an evaluation, and record episodes to a file.
 """
 
 from __future__ import annotations

@@ -89,7 +89,7 @@ def _print_calls(trajectory: Trajectory, result: Replay) -> None:
         console.data(f"environment {world.env}: {world.ended_by}")
         if header.failure is not None and header.failure.kind != "diverged":
             episode = header.episodes[0]
-            console.data(f"  its episode {episode.index} was ended by {', '.join(episode.causes) or 'no named cause'}")
+            console.data(f"  episode {episode.index} was ended by {', '.join(episode.causes) or 'no named cause'}")
         else:
             console.data(
                 f"  {point or 'the replay of this environment does not diverge: the file does not contain the cause'}"

@@ -92,8 +92,8 @@ def _row(run: Overview, runs_dir: Path) -> list[str]:
 def _tags(run: Overview) -> str:
     """Return the text of a run's column REMARK.
 
-    It has the device if this is not the CPU, the number of processes if this is above 1, and `from weights` if the
-    training started with the weights of a checkpoint (--init-from).
+    The text names the device unless the device is the CPU, and the number of processes if there are several. It ends
+    with `from weights` if the training started with the weights of a checkpoint (--init-from).
     """
     tags = []
     if (device := str(run.tags.get("device", "cpu"))) != "cpu":

@@ -1,6 +1,6 @@
 """Command `rlcli show`: printout of a task's resolved configuration.
 
-It can also print the origin of each value (file and line, or option), or the JSON Schema of a task file.
+The command can also print the origin of each value (file and line, or option), or the JSON Schema of a task file.
 """
 
 import json as json_module

@@ -1,6 +1,7 @@
 """Command `rlcli stress`: evaluation of a policy with changed masses, frictions, delays and other parameters.
 
-It prints a table and a heat map of the success rate or return, and fails if a minimum is missed.
+The command prints a table and a heat map of the success rate or the return. It fails with exit code 9 if a minimum
+(`--fail-under`) is missed.
 """
 
 from __future__ import annotations

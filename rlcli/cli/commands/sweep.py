@@ -189,10 +189,10 @@ def _check_options(ctx: typer.Context, task: str | None) -> None:
     given = [name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"]
     if task in _OPTIONS:
         wrong = next((name for name in given if name not in _OPTIONS[task]), None)
-        form, hint = f"sweep {task}", "leave it out; it is an option of a new sweep or of another subcommand"
+        form, hint = f"sweep {task}", "leave out this option of a new sweep or of another subcommand"
     else:
         wrong = next((name for name in given if name in _NOT_OF_A_SWEEP), None)
-        form, hint = "a new sweep", f"leave it out; it is an option of rlcli {_NOT_OF_A_SWEEP.get(wrong or '')}"
+        form, hint = "a new sweep", f"leave out this option of rlcli {_NOT_OF_A_SWEEP.get(wrong or '')}"
     if wrong is not None:
         raise UsageError(f"--{wrong.replace('_', '-')} is not an option of {form}", hint=hint)
     require_known(ctx.params["pruner"], ("median", "none"), "--pruner", "pruners")

@@ -1,6 +1,6 @@
 """Command `rlcli train`: training of a policy, or of several policies with different seeds.
 
-It starts a new run or resumes one, and shows the progress.
+The command starts a new run or resumes one, and shows the progress.
 """
 
 from __future__ import annotations
@@ -128,7 +128,7 @@ def _study(request: TrainingRequest, seeds: str | None, jobs: int | None, seed: 
     if seeds is None and study is None:
         if jobs is not None:
             raise UsageError(
-                "--jobs sets how many trainings run at once, but there is only one",
+                "--jobs sets how many trainings run at once, but there is only one training",
                 hint="add --seeds, as in --seeds 0..4 --jobs 2, or leave out --jobs",
             )
         return None

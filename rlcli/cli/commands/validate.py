@@ -1,6 +1,6 @@
 """Command `rlcli validate`: check of a task's configuration, which reports all mistakes at once.
 
-With --deep it also compiles the model and looks up all names of joints, bodies and sensors in it.
+With --deep the command also compiles the model and looks up all names of joints, bodies and sensors in it.
 """
 
 from typing import Annotated

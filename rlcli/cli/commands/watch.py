@@ -1,6 +1,6 @@
 """Command `rlcli watch`: live view of a training that runs in another terminal.
 
-It reads only the files of the run, so it cannot disturb the training.
+The command only reads the files of the run and does not disturb the training.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Writer for the output of all commands: data on stdout, messages on stderr, one JSON document with --json.
 
-It escapes control characters in texts, because these may come from untrusted files.
+The writer escapes control characters in texts, because texts may come from untrusted files.
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ def show_summary(summary: Mapping[str, Any]) -> None:
     """Print the metrics of an evaluation, each with its 95 % confidence interval.
 
     Args:
-        summary: the result of an evaluation, as its JSON document has it: metric -> mean or rate with `low` and `high`.
+        summary: the result of an evaluation (`Evaluation.summary`): metric -> mean or rate with `low` and `high`.
     """
     entries = [("success rate", summary["success"])] if "success" in summary else []
     for name, condition in summary.get("conditions", {}).items():
@@ -69,7 +69,7 @@ def show_stress(result: StressResult, against: str | None) -> None:
 
     Args:
         result: the evaluations of all variants.
-        against: name of the other policy of --against, for its column; None: there is none.
+        against: name of the policy of --against, which gets a column; None: there is no other policy.
     """
     from rlcli.evaluation.stress_parameters import format_value
 
@@ -102,7 +102,7 @@ def _cells(entry: Mapping[str, Any]) -> list[str]:
 def _labels(names: Sequence[str]) -> Sequence[str]:
     """Return short names of the compared policies.
 
-    They are the last parts of the paths if all last parts differ, else the whole paths.
+    The short names are the last parts of the paths if all last parts differ, else the whole paths.
     """
     short = [Path(name).name or name for name in names]
     return short if len(set(short)) == len(set(names)) else names

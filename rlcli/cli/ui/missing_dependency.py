@@ -1,6 +1,6 @@
 """Conversion of a failed import into an error with the pip command that installs the missing package.
 
-The main function uses it for the optional dependencies of rlcli.
+The main function converts failed imports of rlcli's optional dependencies in this way.
 """
 
 import re

@@ -51,7 +51,7 @@ _AGENT = "Agent of the task: a trainer and its settings. [default: the task's]"
 _CONFIG = "YAML file merged over the task; its key `agent` changes the chosen agent."
 _FEW_ENVS = "Number of environments, whatever scene.num_envs is; at least 8."
 _SEED = "Seed of all random numbers; -1 picks a random one and records it."
-_MAX_MINUTES = "Minutes after which each training stops with a checkpoint; --resume continues it. [default: no limit]"
+_MAX_MINUTES = "Minutes after which each training stops with a checkpoint, for --resume. [default: no limit]"
 _TASK_FOLDER = "Folder of the task's code, if the task is not installed and its folder has moved."
 _RUNS_DIR = "Folder of runs. [default: RLCLI_RUNS_DIR, the settings' runs_dir, or runs]"
 _RECORD_MODE = "Episodes to record: all, succeeded, failed, or separate (one file each for the last two)."
@@ -89,7 +89,7 @@ Headless = Annotated[bool, typer.Option("--headless", hidden=True, help="Open no
 
 
 def _set_verbosity(option: typer.CallbackParam, is_set: bool) -> bool:
-    """Set the verbosity of the console for -q or -v; the last one on the command line counts."""
+    """Set the verbosity of the console for -q or -v; the last of these options on the command line counts."""
     if is_set:
         console.quiet, console.verbose = option.name == "quiet", option.name == "verbose"
     return is_set
@@ -116,7 +116,7 @@ _NEEDED = {
     "episodes": ("verify", "--verify"),
     "steps": ("case", "the number of a recorded episode"),
 }
-"""Option -> another parameter that it needs to have an effect, and how the user writes that parameter."""
+"""Option -> another parameter without which the option has no effect, and how the user writes that parameter."""
 
 
 TYPER_ERRORS = (OSError, EOFError, typer.Exit, typer.Abort, typer.BadParameter)

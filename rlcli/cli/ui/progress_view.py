@@ -16,7 +16,7 @@ from rlcli.training.progress import PARTS, Progress
 LINE_EVERY_S = 5.0
 _WORK_LINE_EVERY_S = 10.0
 _WORK_AFTER_S = 1.4
-"""Time after which the progress of work is shown on a terminal [s]; work that ends earlier shows none."""
+"""Time after which the progress of work is shown on a terminal [s]; shorter work shows no progress."""
 _REDRAW_EVERY_S = 0.25
 _MIN_SHARE, _MIN_ELAPSED_S = 0.2, 30.0
 """The time left is shown when this share of the work is done or this time [s] has passed.

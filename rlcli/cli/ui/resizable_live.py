@@ -1,6 +1,6 @@
 """Version of rich's `Live` display that is drawn correctly after the terminal has been made narrower.
 
-The live views of commands and trainings use it.
+The live views of commands and trainings use this version.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ from rich.segment import Segment
 
 
 class ResizableLive(Live):
-    """rich's `Live`; it also erases the rows into which a narrower terminal has wrapped the lines of the last block."""
+    """rich's `Live`, which also erases the rows into which a narrower terminal has wrapped lines of the last block."""
 
     _drawn: tuple[Any, Any] | None = None
-    """Console options and content with which the block was drawn last; None: it was not drawn yet."""
+    """Console options and content with which the block was drawn last; None: the block was not drawn yet."""
 
     def process_renderables(self, renderables: list[Any]) -> list[Any]:
         """Move the cursor to the start of the last block, and draw the block again."""

@@ -1,6 +1,6 @@
 """Views and tables of several trainings: of a study (one run for each seed), and of a sweep.
 
-`rlcli train --seeds` and `rlcli sweep` use them.
+`rlcli train --seeds` and `rlcli sweep` use this module.
 """
 
 import time

@@ -1,6 +1,6 @@
 """Properties of an output stream: whether it is a terminal, its colours and its width.
 
-The console and the tables use them to decide whether to print colours and to redraw lines.
+The console and the tables decide by these properties whether to print colours and to redraw lines.
 """
 
 from __future__ import annotations

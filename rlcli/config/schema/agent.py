@@ -20,7 +20,7 @@ class AutopsyConfig(StrictModel):
     keep: Annotated[int, Field(ge=1, le=1000)] = 32
     """Number of recordings to keep: the newest ones, with some of every kind of termination."""
     memory_mib: Annotated[int, Field(ge=1, le=1_000_000)] = 256
-    """Memory for the last seconds of all environments [MiB]. If it is too small, fewer seconds are recorded."""
+    """Memory for the last seconds of all environments [MiB]. With too little memory, fewer seconds are recorded."""
 
 
 def parse_threshold(text: str) -> tuple[str, float]:

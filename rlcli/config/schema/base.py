@@ -1,6 +1,6 @@
 """Number types with their allowed ranges, and the base class of all configuration models.
 
-The other modules of the schema use them.
+All other modules of the schema use this module.
 """
 
 import math

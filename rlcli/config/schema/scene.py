@@ -97,7 +97,7 @@ exactly one key."""
 
 
 class ActuatorConfig(StrictModel):
-    """An actuator model that replaces the MJCF's actuators of its joints. It is computed before every physics step."""
+    """An actuator model, computed before every physics step. It replaces the MJCF's actuators of its joints."""
 
     joints: Names
     """Joints that the actuator drives: names or regexes, in this order."""
@@ -182,8 +182,8 @@ class EntityConfig(StrictModel):
     """Colour of a shape: red, green, blue in [0, 1]."""
     pos: Vec3 | None = None
     """Start position of the root in the environment's frame [m]; null: that in the MJCF, and 0 for a shape. The root is
-    the first body of the MJCF, or the shape. It starts there if it can move, and is fixed there otherwise; the rest of
-    the MJCF moves with it. Events that reset the root use this pose. Keyframes of the MJCF are not read."""
+    the first body of the MJCF, or the shape. A root that can move starts there, any other root is fixed there; the rest
+    of the MJCF moves with the root. Events that reset the root use this pose. Keyframes of the MJCF are not read."""
     quat: Quaternion | None = None
     """Start orientation of the root (w, x, y, z) in the environment's frame, which is normalised; null: that in the
     MJCF."""
@@ -245,7 +245,7 @@ class SceneConfig(StrictModel):
     ground: GroundConfig | None = GroundConfig()
     """Ground plane; null: none. A terrain replaces it."""
     terrain: TerrainConfig | None = None
-    """Uneven ground. All environments share it and start at different positions on it."""
+    """Uneven ground. All environments share one terrain and start at different positions on it."""
     lights: LightsConfig = LightsConfig(dome=DomeLightConfig())
     """Lights of the scene: ambient light from all directions, and parallel light."""
     entities: dict[str, EntityConfig] = Field(json_schema_extra={"minProperties": 1, "maxProperties": _MAX_ENTITIES})

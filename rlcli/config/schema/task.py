@@ -62,8 +62,8 @@ class SimConfig(StrictModel):
     environment step; substep: the state before the last physics step, as after `mj_step`. substep is faster, because
     the fields are not computed again."""
     external_forces: bool = False
-    """true: compute `cfrc_ext`, the contact forces on bodies, after every step, as `mj_rnePostConstraint` does. They
-    are 0 in a start state. On a CPU this takes about 15 us for each environment that has contacts."""
+    """true: compute `cfrc_ext`, the contact forces on bodies, after every step, as `mj_rnePostConstraint` does. The
+    forces are 0 in a start state. On a CPU this takes about 15 us for each environment that has contacts."""
     max_velocity: Positive | None = None
     """Speed of a joint or a free body [m/s or rad/s] above which an environment counts as diverged; checked after every
     environment step. null: MuJoCo's own limit, 1e10. A lower limit also catches large finite speeds, such as 1e6 m/s
@@ -149,7 +149,9 @@ class TaskConfig(StrictModel):
         if "sim" in info.data and "decimation" in info.data:
             step_dt = info.data["sim"].dt * info.data["decimation"]
             if value < step_dt:
-                raise ValueError(f"{value:g} s is shorter than one step (dt x decimation = {step_dt:g} s); raise it")
+                raise ValueError(
+                    f"{value:g} s is shorter than one step (dt x decimation = {step_dt:g} s); write a larger number"
+                )
         return value
 
     @field_validator("viewer")

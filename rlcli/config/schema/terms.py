@@ -54,9 +54,9 @@ class TermConfig(StrictModel):
 
 
 class RewardConfig(TermConfig):
-    """A reward term. It adds weight x value x step_dt to the reward of each step.
+    """A reward term, which adds weight x value x step_dt to the reward of each step.
 
-    With `reward_dt_scaling: false` it adds weight x value.
+    With `reward_dt_scaling: false` the term adds weight x value.
     """
 
     weight: Number
@@ -247,7 +247,8 @@ class ObservationConfig(TermConfig):
     noise: NoiseConfig | None = None
     """Noise, sampled in every step; null: none."""
     bias: NoiseConfig | None = None
-    """Constant error of an episode, sampled at its start; null: none. It does not accumulate over episodes."""
+    """Constant error of an episode, sampled at the start of the episode; null: none. Errors of several episodes do not
+    add up."""
     clip: Range | None = None
     """[low, high] limits of the value, in its unit; null: none."""
     scale: Columns | None = None
@@ -277,7 +278,7 @@ class ObservationGroupConfig(StrictModel):
 
 
 class ActionConfig(TermConfig):
-    """An action term. It receives some columns of the policy's output and controls actuators or forces with them."""
+    """An action term, which turns some columns of the policy's output into controls of actuators, or into forces."""
 
     delay: DelayConfig | None = None
     """Delay with which the term receives its columns of the policy's output; null: none. The observation `last_action`

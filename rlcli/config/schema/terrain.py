@@ -178,7 +178,7 @@ class TerrainGeneratorConfig(StrictModel):
     @classmethod
     def _check_proportions(cls, value: dict[str, SubTerrainConfig]) -> dict[str, SubTerrainConfig]:
         if sum(patch.proportion for patch in value.values()) <= 0.0:
-            raise ValueError("the `proportion` of every sub-terrain is 0; set at least one above 0")
+            raise ValueError("the `proportion` of every sub-terrain is 0; set one or more above 0")
         return value
 
 

@@ -1,4 +1,4 @@
 """Templates of the exported programs.
 
-They are ordinary Python files and import nothing of rlcli, because they are copied to machines without it.
+The templates are ordinary Python files. They import nothing of rlcli, because they run on machines without rlcli.
 """

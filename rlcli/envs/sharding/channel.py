@@ -1,6 +1,6 @@
 """Connection between the main process and a worker process, which sends and receives messages over a socket.
 
-Large tensors do not go through it, but through shared memory (`arrays`).
+Large tensors do not go through the socket, but through shared memory (`arrays`).
 """
 
 from __future__ import annotations

@@ -76,7 +76,7 @@ class ShardedEngine:
     def history(self) -> StateHistory:
         """States before the last calls of `step`, but only those of the first shard's environments.
 
-        All shards record the same number of calls; `recorded_calls` returns those of any environment.
+        All shards record the same number of calls; `recorded_calls` returns the recorded calls of any environment.
         """
         return self._local.history
 

@@ -240,7 +240,7 @@ class ShardedEnv(Environment):
     def share(self, specs: Mapping[str, ArraySpec]) -> dict[str, Tensor]:
         """Make tensors of zeros in shared memory, and return them by name.
 
-        In each process they are in `VecEnv.shard.shared`.
+        In each process the tensors are in `VecEnv.shard.shared`.
         """
         self._require_usable()
         self._specs = {**self._specs, **specs}

@@ -206,7 +206,7 @@ class ShardRunner:
         self.stop(Stage.DONE, self._pop_new_columns())
 
     def _observe(self, needs: Needs) -> None:
-        """Choose the stages at which `stop` is called from now on: those that observers of the main process need."""
+        """Call `stop` from now on at the stages that observers of the main process need."""
         for need in needs ^ self._needs:
             change = self.env.observers.add if need in needs else self.env.observers.remove
             change(self._stops[need])

@@ -58,7 +58,7 @@ def number_of_workers(resolved: Resolved, device: str) -> int:
 
 
 def _reason_for_one(resolved: Resolved, device: str) -> str | None:
-    """Return the reason why several processes cannot step a task; None: they can."""
+    """Return the reason why several processes cannot step a task; None: there is no such reason."""
     task = resolved.task
     if device.partition(":")[0] != "cpu" or task.sim.engine == "warp":
         return "a GPU steps all environments at once"

@@ -1,4 +1,4 @@
-"""Randomisation of actuators, and of any model field."""
+"""Event terms that randomise gains, effort limits and strength of actuators, or any field of the model."""
 
 from __future__ import annotations
 
@@ -135,7 +135,7 @@ class RandomizeEffortLimit(RangeKeys, ActuatorTerm):
             bool(model.actuator_forcelimited[id] if place is None else place[0].effort_limit[0, place[1]].isfinite())
             for id, place in zip(ids, modelled, strict=True)
         ]
-        hint = "give its joint an effort_limit"
+        hint = "give the joint of the actuator an effort_limit"
         require_supported(entity, "Actuators", self.actuators, limited, "without an effort limit", hint)
         chosen = column_numbers(self.actuators, len(ids))
         own = [row for row, number in enumerate(chosen) if modelled[number] is None]

@@ -1,4 +1,4 @@
-"""Randomisation of bodies and of gravity."""
+"""Event terms that randomise masses, inertias, centres of mass and poses of bodies, and gravity."""
 
 from __future__ import annotations
 

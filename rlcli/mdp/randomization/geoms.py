@@ -1,4 +1,4 @@
-"""Randomisation of geoms, sites and contact pairs."""
+"""Event terms that randomise frictions, sizes and poses of geoms, poses of sites, and frictions of contact pairs."""
 
 from __future__ import annotations
 

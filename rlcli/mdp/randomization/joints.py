@@ -1,4 +1,4 @@
-"""Randomisation of joints and tendons."""
+"""Event terms that randomise joints (damping, armature, friction, limits, default positions, ...) and tendons."""
 
 from __future__ import annotations
 

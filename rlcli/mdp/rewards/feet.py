@@ -1,4 +1,4 @@
-"""Reward terms of contacts and gait. (num_envs,) each."""
+"""Reward terms of contacts and of feet: air time, slip, clearance, gait. (num_envs,) each."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reward terms of reaching, lifting, placing and opening. (num_envs,) each."""
+"""Reward terms of manipulation: reach a pose, grasp and lift an object, open a drawer. (num_envs,) each."""
 
 from __future__ import annotations
 
