@@ -112,7 +112,8 @@ def compute_rot(
 
     Returns:
         Linear and angular velocity in the torso's frame (n, 3) each; roll, pitch and yaw in [0, 2 pi) [rad] (n,) each;
-        the direction to the target minus the yaw [rad] (n,).
+        the direction to the target minus the yaw [rad] (n,). As in Isaac Sim, this direction is computed from the x and
+        z coordinates.
     """
     roll, pitch, yaw = get_euler_xyz(torso_quat)
     walk = torch.atan2(targets[:, 2] - torso_positions[:, 2], targets[:, 0] - torso_positions[:, 0])
