@@ -20,7 +20,7 @@ circle has 38 % of the area, so all samples are inside of it once in 10^13 episo
 
 
 class _Arm(GymnasiumTask):
-    """Base of both arms: finds bodies by name."""
+    """Base class of the reacher and the pusher; it finds the bodies of the model by name."""
 
     reads = ("xpos",)
 
@@ -35,7 +35,7 @@ class _Arm(GymnasiumTask):
         super().post_reset()
 
     def velocities(self, selection: Selection, still: int) -> Tensor:
-        """Sample joint velocities in +-0.005; the last `still` joints, which have no actuator, get 0. (rows, nv)"""
+        """Sample initial joint velocities in +-0.005; the last `still` joints, without actuator, get 0. (rows, nv)"""
         noise = self.noise(selection, 0.005, self.model.nv)
         noise[:, -still:] = 0.0
         return noise
@@ -61,7 +61,7 @@ class Reacher(_Arm):
     params: Params
 
     def columns(self) -> list[Tensor]:
-        """Return the parts of the observation: state of the arm, target, and the vector between them."""
+        """Return the observation: state of the arm, target, and vector from target to fingertip. (num_envs, k) each"""
         qpos, angles = self.field.qpos, self.field.qpos[:, :2]
         return [angles.cos(), angles.sin(), qpos[:, 2:], self.field.qvel[:, :2], self.gap()[:, :2]]
 
@@ -75,7 +75,7 @@ class Reacher(_Arm):
         return -length(self.gap()) * params.reward_dist_weight - self.action_cost(params.reward_control_weight)
 
     def start(self, selection: Selection) -> tuple[Tensor, Tensor]:
-        """Sample a nearly straight arm, and a target within 0.2 m."""
+        """Sample initial states: a nearly straight arm, a target within 0.2 m of its base. (rows, nq), (rows, nv)"""
         qpos = self.start_pos + self.noise(selection, 0.1, self.model.nq)
         radius, turn = 0.2 * selection.uniform(0.0, 1.0).sqrt(), selection.uniform(-math.pi, math.pi)
         qpos[:, -2:] = torch.stack([radius * turn.cos(), radius * turn.sin()], dim=1)
@@ -104,7 +104,7 @@ class Pusher(_Arm):
     params: Params
 
     def columns(self) -> list[Tensor]:
-        """Return the parts of the observation: state of the arm, its tip, the puck and the goal."""
+        """Return the observation: state of the arm, positions of its tip, the puck and the goal. (num_envs, k) each"""
         places = [self.body_position(body) for body in ("tips_arm", "object", "goal")]
         return [self.field.qpos[:, :7], self.field.qvel[:, :7], *places]
 
@@ -116,7 +116,7 @@ class Pusher(_Arm):
         return far - self.action_cost(params.reward_control_weight) + near
 
     def start(self, selection: Selection) -> tuple[Tensor, Tensor]:
-        """Sample the puck's position in a box, more than 0.17 m from the goal."""
+        """Sample initial states, with the puck in a box and over 0.17 m from the goal. (rows, nq), (rows, nv)"""
         x = selection.uniform(-0.3, 0.0, (_CANDIDATES,))
         y = selection.uniform(-0.2, 0.2, (_CANDIDATES,))
         off = (x * x + y * y).sqrt() > 0.17

@@ -33,7 +33,7 @@ class GymnasiumTask(DirectTask):
     """Whether the reward uses `speed`; the base class then stores `progress` before each step."""
 
     def set_up_scene(self, scene) -> None:
-        """Replace the PGS solver by Newton on MuJoCo Warp, which has no PGS."""
+        """Replace the PGS solver by Newton's method if the task runs on MuJoCo Warp, which has no PGS."""
         on_warp = self.cfg.sim.engine == "warp" or (self.cfg.sim.engine == "auto" and self.device.type == "cuda")
         if on_warp and scene.spec.option.solver == mujoco.mjtSolver.mjSOL_PGS:
             scene.spec.option.solver = mujoco.mjtSolver.mjSOL_NEWTON
@@ -92,7 +92,7 @@ class GymnasiumTask(DirectTask):
         raise NotImplementedError
 
     def check_termination(self) -> None:
-        """Fill `ended` where the task terminates the episode. By default it never does."""
+        """Set `ended` to true where the task terminates the episode. The base class never terminates an episode."""
 
     def start(self, selection: Selection) -> tuple[Tensor, Tensor]:
         """Return initial positions and velocities, one row per environment that resets. (rows, nq), (rows, nv)"""
@@ -114,13 +114,13 @@ class GymnasiumTask(DirectTask):
         return weight * float32_sum(self.actions.square())
 
     def uniform_start(self, selection: Selection, scale: float) -> tuple[Tensor, Tensor]:
-        """Sample positions around the model's, and velocities around 0, uniformly in +-scale. (rows, nq), (rows, nv)"""
+        """Sample positions in qpos0 +- scale and velocities in +-scale, uniformly. (rows, nq), (rows, nv)"""
         positions = self.model.nq
         noise = self.noise(selection, scale, positions + self.model.nv)
         return self.start_pos + noise[:, :positions], noise[:, positions:]
 
     def gaussian_start(self, selection: Selection, scale: float) -> tuple[Tensor, Tensor]:
-        """Sample positions within +-scale of the model's, and velocities of std `scale`. (rows, nq), (rows, nv)"""
+        """Sample positions in qpos0 +- scale, and normal velocities with std `scale`. (rows, nq), (rows, nv)"""
         qpos = self.start_pos + self.noise(selection, scale, self.model.nq)
         return qpos, selection.normal(0.0, scale, (self.model.nv,))
 

@@ -23,7 +23,7 @@ _NAMES = (
 
 
 class _Humanoid(GymnasiumTask):
-    """Base of both tasks: observations and initial state."""
+    """Base class of both humanoid tasks: observations, initial states and costs."""
 
     num_observations = 348
     num_actions = 17
@@ -31,7 +31,7 @@ class _Humanoid(GymnasiumTask):
     reads = ("xipos", "cinert", "cvel", "qfrc_actuator", "cfrc_ext")
 
     def columns(self) -> list[Tensor]:
-        """Return the parts of the observation: qpos without x and y; qvel; inertia, velocity, forces of bodies."""
+        """Return the observation: qpos without x, y; qvel; inertia, velocity, forces of bodies. (num_envs, k) each"""
         field = self.field
         return [
             field.qpos[:, 2:],
@@ -47,11 +47,11 @@ class _Humanoid(GymnasiumTask):
         return self.uniform_start(selection, self.params.reset_noise_scale)
 
     def control_cost(self) -> Tensor:
-        """Return the cost of the controls as stored in the engine. (num_envs,)"""
+        """Return the weighted sum of squared controls, read from the engine. (num_envs,)"""
         return self.params.ctrl_cost_weight * square_sum(self.field.ctrl.contiguous())
 
     def force_cost(self, weight: float, bounds: tuple[float | None, float | None]) -> Tensor:
-        """Return the weighted sum of squared contact forces, clipped to bounds. (num_envs,)"""
+        """Return the weighted sum of squared contact forces, clipped to `bounds`; None: no bound. (num_envs,)"""
         low, high = bounds
         return (weight * square_sum(self.field.cfrc_ext)).clamp(low, high)
 
@@ -71,7 +71,7 @@ class Humanoid(_Humanoid):
         forward_reward_weight: float = Field(1.25, description="Reward on the speed of the centre of mass [s/m].")
         contact_cost_weight: float = Field(5e-7, ge=0, description="Penalty on the sum of squared contact forces.")
         contact_cost_range: tuple[float | None, float | None] = Field(
-            (None, 10.0), description="Lower and upper bound of that penalty; null: no bound."
+            (None, 10.0), description="Lower and upper bound of the penalty on contact forces; null: no bound."
         )
         healthy_reward: float = Field(5.0, description="Reward of a step that does not end the episode.")
         healthy_z_range: tuple[float, float] = Field(
@@ -121,13 +121,13 @@ class HumanoidStandup(_Humanoid):
         )
         impact_cost_weight: float = Field(5e-7, ge=0, description="Penalty on the sum of squared contact forces.")
         impact_cost_range: tuple[float | None, float | None] = Field(
-            (None, 10.0), description="Lower and upper bound of that penalty; null: no bound."
+            (None, 10.0), description="Lower and upper bound of the penalty on contact forces; null: no bound."
         )
 
     params: Params
 
     def compute_reward(self) -> Tensor:
-        """Return the reward: weight x height / physics step, minus the cost of controls and impacts, plus 1."""
+        """Return weight x height / physics step, minus the costs of controls and contact forces, plus 1. (num_envs,)"""
         params = self.params
         height = params.uph_cost_weight * self.field.qpos[:, 2] / self.env.physics_dt
         return height - self.control_cost() - self.force_cost(params.impact_cost_weight, params.impact_cost_range) + 1

@@ -30,7 +30,7 @@ class InvertedPendulum(GymnasiumTask):
     params: Params
 
     def columns(self) -> list[Tensor]:
-        """Return the parts of the observation: joint positions and velocities."""
+        """Return the parts of the observation: joint positions and velocities. (num_envs, k) each"""
         return [self.field.qpos, self.field.qvel]
 
     def compute_reward(self) -> Tensor:
@@ -69,13 +69,13 @@ class InvertedDoublePendulum(GymnasiumTask):
     params: Params
 
     def columns(self) -> list[Tensor]:
-        """Return the parts of the observation: cart, sines and cosines of angles, velocities, force on the cart."""
+        """Return the observation: cart, sines and cosines of angles, velocities, cart's force. (num_envs, k) each"""
         qpos, force = self.field.qpos, self.field.qfrc_constraint[:, :1]
         angles = qpos[:, 1:]
         return [qpos[:, :1], angles.sin(), angles.cos(), self.field.qvel.clamp(-10.0, 10.0), force.clamp(-10.0, 10.0)]
 
     def compute_reward(self) -> Tensor:
-        """Return a bonus, minus the distance of the tip from its goal and the speed of the poles."""
+        """Return `healthy_reward`, minus costs of the tip's distance from its goal and of pole speeds. (num_envs,)"""
         x, height = self.field.site_xpos[:, 0, 0], self.field.site_xpos[:, 0, 2]
         first, second = self.field.qvel[:, 1], self.field.qvel[:, 2]
         distance = 0.01 * x.square() + (height - 2).square()

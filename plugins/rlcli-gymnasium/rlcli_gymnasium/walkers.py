@@ -52,11 +52,11 @@ class Ant(GymnasiumTask):
         return self.field.xpos[:, self.torso, 0]
 
     def contact_forces(self) -> Tensor:
-        """Return clipped contact forces. (num_envs, bodies, 6)"""
+        """Return torque and force of contacts on each body, clipped. (num_envs, bodies, 6) [N m, N]"""
         return self.field.cfrc_ext.clamp(*self.params.contact_force_range)
 
     def columns(self) -> list[Tensor]:
-        """Return the parts of the observation: pose without x and y, velocity, and contact forces."""
+        """Return the observation: pose without x and y, velocity, and contact forces. (num_envs, k) each"""
         return [self.field.qpos[:, 2:], self.field.qvel, self.contact_forces()[:, 1:].flatten(1)]
 
     def healthy(self) -> Tensor:
@@ -101,7 +101,7 @@ class HalfCheetah(GymnasiumTask):
     params: Params
 
     def columns(self) -> list[Tensor]:
-        """Return the parts of the observation: joint positions without x, and velocities."""
+        """Return the parts of the observation: joint positions without x, and velocities. (num_envs, k) each"""
         return [self.field.qpos[:, 1:], self.field.qvel]
 
     def compute_reward(self) -> Tensor:
@@ -133,7 +133,7 @@ class Swimmer(HalfCheetah):
     params: Params
 
     def columns(self) -> list[Tensor]:
-        """Return the parts of the observation: joint positions without x and y, and velocities."""
+        """Return the parts of the observation: joint positions without x and y, and velocities. (num_envs, k) each"""
         return [self.field.qpos[:, 2:], self.field.qvel]
 
     def start(self, selection: Selection) -> tuple[Tensor, Tensor]:
@@ -166,7 +166,7 @@ class Walker2d(GymnasiumTask):
     params: Params
 
     def columns(self) -> list[Tensor]:
-        """Return the parts of the observation: joint positions without x, and velocities clipped to +-10."""
+        """Return the observation: joint positions without x, and velocities clipped to +-10. (num_envs, k) each"""
         return [self.field.qpos[:, 1:], self.field.qvel.clamp(-10.0, 10.0)]
 
     def healthy(self) -> Tensor:
@@ -203,7 +203,7 @@ class Hopper(Walker2d):
         ctrl_cost_weight: float = Field(1e-3, ge=0, description="Penalty on the sum of squared actions.")
         healthy_reward: float = Field(1.0, description="Reward of a step that does not end the episode.")
         healthy_state_range: tuple[float, float] = Field(
-            (-100.0, 100.0), description="Range of all states except x and z."
+            (-100.0, 100.0), description="Range of all positions and velocities except x and z."
         )
         healthy_z_range: tuple[float, float | None] = Field(
             (0.7, None),

@@ -69,7 +69,7 @@ class AffineActionTerm(ActionTerm):
         self._processed_actions[:] = torch.clamp(wanted, self._clip[..., 0], self._clip[..., 1])
 
     def reset(self, env_ids: Any = None) -> None:
-        """Set the raw actions to zero."""
+        """Set the raw actions of the environments `env_ids` to zero; None: of all environments."""
         self._raw_actions[slice(None) if env_ids is None else env_ids] = 0.0
 
 

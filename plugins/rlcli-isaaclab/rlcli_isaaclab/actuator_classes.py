@@ -77,7 +77,7 @@ class ActuatorBase:
         return found
 
     def _clip_effort(self, effort: Tensor) -> Tensor:
-        """Return efforts clipped to +-`effort_limit`."""
+        """Return efforts clipped to +-`effort_limit`. (num_envs, joints) [N or N m]"""
         return torch.clip(effort, -self.effort_limit, self.effort_limit)
 
 
@@ -92,7 +92,7 @@ class IdealPDActuator(ActuatorBase):
     """PD controller with a limit on the effort."""
 
     def compute(self, control_action: ArticulationActions, joint_pos: Tensor, joint_vel: Tensor) -> ArticulationActions:
-        """Return the efforts of the controller."""
+        """Return the efforts of the controller [N or N m], within `effort_limit`."""
         position, velocity = control_action.joint_positions, control_action.joint_velocities
         effort = torch.zeros_like(joint_pos) if control_action.joint_efforts is None else control_action.joint_efforts
         effort = effort + self.stiffness * (joint_pos if position is None else position).sub(joint_pos)
@@ -123,7 +123,7 @@ class DCMotor(IdealPDActuator):
         self._joint_vel = torch.zeros_like(self.computed_effort)
 
     def compute(self, control_action: ArticulationActions, joint_pos: Tensor, joint_vel: Tensor) -> ArticulationActions:
-        """Return the efforts of the controller, within the torque-speed curve."""
+        """Return the efforts of the controller [N or N m], within the torque-speed curve."""
         self._joint_vel[:] = joint_vel
         return super().compute(control_action, joint_pos, joint_vel)
 
@@ -136,7 +136,7 @@ class DCMotor(IdealPDActuator):
 
 
 class DelayedPDActuator(IdealPDActuator):
-    """A PD controller whose targets are delayed by some physics steps; the delay is drawn for each episode."""
+    """A PD controller whose targets are delayed by some physics steps; each episode samples its delay."""
 
     def __init__(self, cfg: Any, *args: Any, **defaults: Any) -> None:
         super().__init__(cfg, *args, **defaults)
@@ -144,7 +144,7 @@ class DelayedPDActuator(IdealPDActuator):
         self._delayed_positions, self._delayed_velocities, self._delayed_efforts = delays
 
     def reset(self, env_ids: Any) -> None:
-        """Draw the delays of new episodes."""
+        """Sample new delays in the environments `env_ids`, whose episodes begin; None: in all environments."""
         rows = torch.arange(self._num_envs, device=self._device)[slice(None) if env_ids is None else env_ids]
         lags = torch.randint(self.cfg.min_delay, self.cfg.max_delay + 1, (len(rows),), device=self._device)
         for delay in (self._delayed_positions, self._delayed_velocities, self._delayed_efforts):
@@ -152,7 +152,7 @@ class DelayedPDActuator(IdealPDActuator):
             delay.reset(rows)
 
     def compute(self, control_action: ArticulationActions, joint_pos: Tensor, joint_vel: Tensor) -> ArticulationActions:
-        """Return the efforts of the controller for the delayed targets."""
+        """Return the efforts of the controller for the delayed targets [N or N m]."""
         pairs = (
             (self._delayed_positions, control_action.joint_positions),
             (self._delayed_velocities, control_action.joint_velocities),

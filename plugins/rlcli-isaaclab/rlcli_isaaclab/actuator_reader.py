@@ -133,7 +133,7 @@ def _read_implicit_limits(item: Node) -> dict[str, Any]:
 
 
 def _speed_limit(item: Node) -> Any:
-    """Return the speed limit of an explicit actuator."""
+    """Return the speed limit of an explicit actuator, a number or a mapping from joint patterns; None: no limit."""
     item.note("approximated", "velocity_limit_sim", _NO_SPEED_LIMIT)
     limit, of_solver = item.get("velocity_limit"), item.get("velocity_limit_sim")
     return of_solver if limit is None else limit

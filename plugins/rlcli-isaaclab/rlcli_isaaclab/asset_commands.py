@@ -36,7 +36,14 @@ class JointDrive:
             self.target.copy_(entity.data.default_joint_pos)
 
     def set(self, target: Tensor, joint_ids: Any, env_ids: Any) -> None:
-        """Set targets of joints. A joint without such an actuator ignores position targets.
+        """Set targets of joints in some environments. (rows, joints) [m or rad, m/s or rad/s, N or N m]
+
+        A joint without an actuator of the drive's kind ignores position targets.
+
+        Args:
+            target: values of the kind of this drive.
+            joint_ids: indices or slice of the joints; None: all joints.
+            env_ids: indices of the environments, one for each row; None: all environments.
 
         Raises:
             TaskError: for a velocity or effort target other than 0 of a joint without such an actuator.
@@ -103,7 +110,16 @@ class BodyWrench:
         is_global: bool = False,
         **other: Any,
     ) -> None:
-        """Replace forces [N] and torques [N m]. (rows, bodies, 3) each"""
+        """Replace the forces [N] and torques [N m] on bodies. (rows, bodies, 3) each; None: unchanged
+
+        Args:
+            forces: new forces.
+            torques: new torques.
+            body_ids: indices of the bodies; None: all bodies.
+            env_ids: indices of the environments, one for each row; None: all environments.
+            is_global: whether the vectors are in the world frame, else in the frames of the bodies.
+            other: further arguments of Isaac Lab's method, which have no effect.
+        """
         local = self.local
         count = local.shape[1]
         rows = torch.arange(self._env.num_envs) if env_ids is None else torch.as_tensor(env_ids)
@@ -114,12 +130,12 @@ class BodyWrench:
         self._is_global = is_global
 
     def reset(self, env_ids: Any) -> None:
-        """Remove the forces of some environments."""
+        """Remove the forces in the environments `env_ids`; None: in all environments."""
         if self._local is not None:
             self._local[slice(None) if env_ids is None else env_ids] = 0.0
 
     def apply(self) -> None:
-        """Write the forces for the next physics step."""
+        """Write the forces of the next physics step to the engine, in the world frame."""
         if self._local is None:
             return
         world = self._local
@@ -170,7 +186,7 @@ class PhysxView:
         return self._model_values("body_mass")
 
     def set_masses(self, masses: Tensor, indices: Any) -> None:
-        """Set the masses of some environments; inertias stay. (num_envs, bodies) [kg]"""
+        """Set the masses in the environments `indices`; inertias stay. masses (num_envs, bodies) [kg]"""
         self._write_model("body_mass", masses, indices)
 
     def get_inertias(self) -> Tensor:
@@ -178,7 +194,7 @@ class PhysxView:
         return torch.diag_embed(self._model_values("body_inertia")).flatten(2)
 
     def set_inertias(self, inertias: Tensor, indices: Any) -> None:
-        """Set the moments of inertia of some environments. (num_envs, bodies, 9) [kg m^2]
+        """Set the moments of inertia in the environments `indices`. inertias (num_envs, bodies, 9) [kg m^2]
 
         Raises:
             TaskError: for a product of inertia: MuJoCo stores the principal moments.
@@ -196,7 +212,9 @@ class PhysxView:
         return torch.cat([self._model_values("body_ipos"), quat], dim=-1)
 
     def set_coms(self, coms: Tensor, indices: Any) -> None:
-        """Set centres of mass and principal axes of some environments. (num_envs, bodies, 7)
+        """Set centres of mass [m] and principal axes (x, y, z, w) in the environments `indices`.
+
+        coms (num_envs, bodies, 7), in the frames of the bodies
 
         Raises:
             TaskError: if the model was compiled for centres of mass that do not move.
@@ -232,7 +250,7 @@ class PhysxView:
         return torch.stack([friction, friction, torch.zeros_like(friction)], dim=-1)
 
     def set_material_properties(self, materials: Tensor, indices: Any) -> None:
-        """Set the dynamic friction (column 1) of the geoms of some environments. materials (num_envs, geoms, 3)"""
+        """Set the dynamic friction (column 1) of geoms in the environments `indices`. materials (num_envs, geoms, 3)"""
         if bool(materials[..., 2].any()) or not torch.equal(materials[..., 0], materials[..., 1]):
             report_once("root_physx_view.set_material_properties: only the dynamic friction is set; MuJoCo has no"
                         " static friction and no restitution")  # fmt: skip

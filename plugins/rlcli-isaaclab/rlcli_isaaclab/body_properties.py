@@ -8,7 +8,7 @@ from rlcli_isaaclab.settings import Node
 
 
 def read_body_properties(spawn: Node, is_fixed: bool | None = None) -> dict[str, Any]:
-    """Return the settings of an entity that the properties give, and report those without a counterpart.
+    """Return rlcli's settings of an entity for these properties; report properties without a counterpart in rlcli.
 
     Args:
         spawn: settings `spawn` of the asset.

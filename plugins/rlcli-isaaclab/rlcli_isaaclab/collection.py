@@ -77,7 +77,7 @@ class RigidObjectCollection:
         return [(self._objects[i], values[:, column]) for column, i in enumerate(ids)]
 
     def reset(self, env_ids: Any = None, object_ids: Any = None) -> None:
-        """Remove forces on the objects."""
+        """Remove the forces on all objects in the environments `env_ids`; None: in all environments."""
         for item in self._objects:
             item.reset(env_ids)
 

@@ -37,7 +37,7 @@ def import_run(
     for name, file in models.items():
         if not file or not Path(file).is_file():
             raise UsageError(
-                f"--model {name}={file}: there is no file {file}",
+                f"--model {name}={file}: there is no file '{file}'",
                 hint="correct the path, as in --model robot=robot.xml",
             )
     return convert(env, agent, output or Path("imported"), models)

@@ -30,7 +30,15 @@ class modify_env_param(ManagerTermBase):  # noqa: N801  (Isaac Lab's name)
         self._value = torch.tensor(self._setting.start, dtype=torch.float64)
 
     def __call__(self, env: Any, env_ids: Any, modify_fn: Any, modify_params: Any = None, **opened: Tensor) -> None:
-        """Change the setting; `opened` has the tensors of rlcli's settings that depend on it, changed in place."""
+        """Change the setting, at the resets of the environments `env_ids`.
+
+        Args:
+            env: environment, with Isaac Lab's interface.
+            env_ids: indices of the environments that reset.
+            modify_fn: function that returns the new value, or NO_CHANGE.
+            modify_params: further arguments of `modify_fn`; None: none.
+            opened: tensors of rlcli's settings that depend on this setting; they are changed in place.
+        """
         value = _in_form_of(self._setting.start, self._value.tolist())
         new = modify_fn(env, env_ids, value, **(modify_params or {}))
         if new is self.NO_CHANGE:
@@ -91,7 +99,7 @@ class ChangedSetting:
         return [found[name] for _, name in self.addresses]
 
     def write(self, env: Any, value: Any) -> None:
-        """Write a value into the term of the environment that runs the user's own code."""
+        """Write a value into the settings of the term, for a term that runs the user's own code."""
         bound = env.managed._bound.get(self.section, [])
         if self.section == "observations":
             bound = env.managed._observations[self.term[0]]

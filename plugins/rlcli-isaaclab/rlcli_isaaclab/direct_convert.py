@@ -38,7 +38,7 @@ def direct_task(cfg: Any, env_class: type, root: Path, models: Mapping[str, Any]
 
     Args:
         cfg: configuration of the task.
-        env_class: its environment class.
+        env_class: environment class of the task.
         root: folder of the task.
         models: values of the option `--model`, NAME -> FILE.
 
@@ -131,7 +131,7 @@ def _rename_spaces(cfg: Any) -> None:
 
 
 def _require_values(cfg: Any, *names: str) -> None:
-    """Check that settings without a default are set."""
+    """Raise ConfigError if one of the settings `names`, which have no default, is not set."""
     missing = [name for name in names if is_missing(getattr(cfg, name))]
     if missing:
         raise ConfigError([Problem("configuration", name, "missing; give it a value") for name in missing])

@@ -157,7 +157,7 @@ class DirectRLEnv(gymnasium.Env):
 
     @property
     def event_manager(self) -> Any:
-        """Event manager."""
+        """Manager of the task's events."""
         return self.managed.event_manager
 
     def set_debug_vis(self, debug_vis: bool) -> bool:
@@ -165,10 +165,10 @@ class DirectRLEnv(gymnasium.Env):
         return False
 
     def _setup_scene(self) -> None:
-        """Create the assets and sensors of the scene."""
+        """Create the assets and sensors of the scene. The base class creates none."""
 
     def _pre_physics_step(self, actions: Tensor) -> None:
-        """Store or process the actions, once per step."""
+        """Store or process the actions, once per environment step. (num_envs, a)"""
         raise NotImplementedError(f"class {type(self).__name__} has no method _pre_physics_step; implement it")
 
     def _apply_action(self) -> None:
@@ -176,14 +176,14 @@ class DirectRLEnv(gymnasium.Env):
         raise NotImplementedError(f"class {type(self).__name__} has no method _apply_action; implement it")
 
     def _get_observations(self) -> Any:
-        """Return the observations by group."""
+        """Return the observations, once per environment step: name of the group -> (num_envs, ...)."""
         raise NotImplementedError(f"class {type(self).__name__} has no method _get_observations; implement it")
 
     def _get_states(self) -> Any:
-        """Return the observations of the critic."""
+        """Return the observations of the critic, (num_envs, ...); called only if `state_space` is set."""
 
     def _get_rewards(self) -> Tensor:
-        """Return the reward. (num_envs,)"""
+        """Return the reward of each environment in this step. (num_envs,)"""
         raise NotImplementedError(f"class {type(self).__name__} has no method _get_rewards; implement it")
 
     def _get_dones(self) -> tuple[Tensor, Tensor]:
@@ -191,7 +191,7 @@ class DirectRLEnv(gymnasium.Env):
         raise NotImplementedError(f"class {type(self).__name__} has no method _get_dones; implement it")
 
     def _reset_idx(self, env_ids: Any) -> None:
-        """Remove the forces on bodies. rlcli's environment resets everything else, and runs the reset events."""
+        """Remove the forces on bodies in the environments `env_ids`; rlcli resets the rest and runs reset events."""
         for asset in self.scene.articulations.values():
             asset.reset(env_ids)
 
@@ -277,7 +277,11 @@ class DirectMARLEnvCfg:
 
 
 def _environment_class(cfg: Any) -> type[DirectRLEnv]:
-    """Return the environment class: the registered one, or else the only one in the configuration's module."""
+    """Return the environment class: the registered one, or else the only one in the configuration's module.
+
+    Raises:
+        ConfigError: if there is none, if there are several, or if the object is not a DirectRLEnv.
+    """
     from rlcli.registry import load_object
 
     entry = getattr(cfg, "rlcli_class", None)
@@ -302,6 +306,9 @@ def record(env_class: type[DirectRLEnv], cfg: Any) -> tuple[Setup, Any]:
     """Run the task's `__init__` up to the end of `_setup_scene`, without a simulation.
 
     Return (objects that `_setup_scene` created, environment). The task's `__init__` may change `cfg`.
+
+    Raises:
+        TaskError: if the task's `__init__` does not call the `__init__` of DirectRLEnv.
     """
     setup = Setup()
     with running(setup), building(_Shell(cfg)):

@@ -82,7 +82,7 @@ class DirectRunner:
         self._observed: dict[str, Tensor] = {}
 
     def apply(self) -> None:
-        """Call `_apply_action` before a physics step."""
+        """Call `_apply_action`, and write the task's forces, before a physics step."""
         self.lab._apply_action()
         for asset in self.lab.scene.articulations.values():
             asset.apply_wrenches()
@@ -97,7 +97,7 @@ class DirectRunner:
         self.phase = "restored"
 
     def process(self, action: Tensor) -> None:
-        """Call `_pre_physics_step`."""
+        """Call `_pre_physics_step` with the action and its noise, and `_apply_action` in the next physics steps."""
         self.lab._pre_physics_step(self.action_noise(action.clone()))
         self._substeps.start()
 
@@ -112,7 +112,7 @@ class DirectRunner:
         self.phase = "done"
 
     def reset_envs(self, selection: Selection) -> None:
-        """Call `_reset_idx`."""
+        """Call `_reset_idx` for the selected environments, and reset the noise models there."""
         ids = selection.env_ids()
         if len(ids):
             self.log.call_reset(lambda: self.lab._reset_idx(ids))
@@ -192,7 +192,7 @@ class _Action(_Hook):
         self.sinks = ("direct task",)
 
     def process(self, action: Tensor) -> None:
-        """Call `_pre_physics_step`."""
+        """Call `_pre_physics_step` with the policy's action. (num_envs, a)"""
         self._runner.process(action)
 
 

@@ -9,7 +9,10 @@ from rlcli_isaaclab.namespace import public_names
 
 
 def import_hint(error: BaseException) -> str | None:
-    """Return a hint for a failed import from Isaac Lab, or for a name that this package does not have."""
+    """Return a hint for a failed import from Isaac Lab, or for a name that this package does not have.
+
+    Return None if the error has another cause, or no similar name is known.
+    """
     module = getattr(error, "name", None) or ""
     if isinstance(error, ModuleNotFoundError):
         return str(error).partition("; ")[2] or _ALL if module.partition(".")[0].startswith("isaaclab") else None

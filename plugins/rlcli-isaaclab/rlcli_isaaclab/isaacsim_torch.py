@@ -20,7 +20,7 @@ quat_rotate, quat_rotate_inverse = rotate, rotate_inverse
 
 
 def quat_apply(a: Tensor, b: Tensor) -> Tensor:
-    """Rotate vectors. (..., 4), (..., 3) -> (..., 3)"""
+    """Return the vectors b rotated by the quaternions a. (..., 4), (..., 3) -> (..., 3)"""
     return rotate(a.reshape(-1, 4), b.reshape(-1, 3)).reshape(b.shape)
 
 
@@ -37,12 +37,12 @@ def normalize_angle(x: Tensor) -> Tensor:
 
 
 def tf_combine(q1: Tensor, t1: Tensor, q2: Tensor, t2: Tensor) -> tuple[Tensor, Tensor]:
-    """Return a pose (q2, t2), which is relative to the frame (q1, t1), in the parent frame of that frame."""
+    """Return the pose (q2, t2), given in the frame (q1, t1), in the parent frame of (q1, t1). (n, 4), (n, 3)"""
     return quat_mul(q1, q2), quat_apply(q1, t2) + t1
 
 
 def tf_inverse(q: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the inverse of a pose: quaternion and position."""
+    """Return the inverse of the pose (q, t): quaternion (n, 4) and position (n, 3)."""
     back = quat_conjugate(q)
     return back, -quat_apply(back, t)
 
@@ -53,22 +53,22 @@ def tf_apply(q: Tensor, t: Tensor, v: Tensor) -> Tensor:
 
 
 def tf_vector(q: Tensor, v: Tensor) -> Tensor:
-    """Return the vector v rotated by q; t is not used. (..., 4), (..., 3), (..., 3) -> (..., 3)"""
+    """Return the vector v rotated by the quaternion q. (..., 4), (..., 3) -> (..., 3)"""
     return quat_apply(q, v)
 
 
 def scale(x: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
-    """Map [-1, 1] to [lower, upper]."""
+    """Return x mapped linearly from [-1, 1] to [lower, upper], in the shape of x."""
     return 0.5 * (x + 1.0) * (upper - lower) + lower
 
 
 def unscale(x: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
-    """Map [lower, upper] to [-1, 1]."""
+    """Return x mapped linearly from [lower, upper] to [-1, 1], in the shape of x."""
     return (2.0 * x - upper - lower) / (upper - lower)
 
 
 def saturate(x: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
-    """Clamp values to [lower, upper]."""
+    """Return x clamped to [lower, upper]."""
     return torch.maximum(torch.minimum(x, upper), lower)
 
 
@@ -76,12 +76,12 @@ tensor_clamp = saturate
 
 
 def torch_rand_float(lower: float, upper: float, shape: Any, device: Any) -> Tensor:
-    """Sample uniformly from [lower, upper)."""
+    """Return a tensor of this shape with uniform samples from [lower, upper)."""
     return (upper - lower) * torch.rand(*shape, device=device) + lower
 
 
 def to_torch(x: Any, dtype: torch.dtype = torch.float, device: Any = "cpu", requires_grad: bool = False) -> Tensor:
-    """Return a value as a tensor."""
+    """Return a number, list or array as a new tensor."""
     return torch.tensor(np.asarray(x), dtype=dtype, device=device, requires_grad=requires_grad)
 
 
@@ -112,7 +112,8 @@ def compute_rot(
 
     Returns:
         Linear and angular velocity in the torso's frame (n, 3) each; roll, pitch and yaw in [0, 2 pi) [rad] (n,) each;
-        the direction to the target minus the yaw [rad] (n,).
+        the direction to the target minus the yaw [rad] (n,). As in Isaac Sim, this direction is computed from the x and
+        z coordinates.
     """
     roll, pitch, yaw = get_euler_xyz(torso_quat)
     walk = torch.atan2(targets[:, 2] - torso_positions[:, 2], targets[:, 0] - torso_positions[:, 0])

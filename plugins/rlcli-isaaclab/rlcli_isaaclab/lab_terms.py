@@ -85,7 +85,10 @@ class reset_joints_within_limits_range(ManagerTermBase):  # noqa: N801  (Isaac L
         self, env: Any, env_ids: Tensor, position_range: Any, velocity_range: Any, use_default_offset: bool = False,
         asset_cfg: Any = None, operation: str = "abs",
     ) -> None:  # fmt: skip
-        """Sample positions and velocities of joints in the environments `env_ids`."""
+        """Sample positions and velocities of joints in the environments `env_ids`.
+
+        `__init__` has read the ranges; the arguments after `env_ids` are not read here.
+        """
         data = self._asset.data
         state = {"position_range": data.default_joint_pos, "velocity_range": data.default_joint_vel}
         for key, (joints, ranges) in self._ranges.items():

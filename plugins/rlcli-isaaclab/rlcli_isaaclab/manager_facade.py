@@ -50,7 +50,7 @@ class ActionManagerFacade(ManagerFacade):
 
     @property
     def total_action_dim(self) -> int:
-        """Number of actions."""
+        """Number of columns of the policy's action, of all action terms together."""
         return self._manager.size
 
     def get_term(self, name: str) -> Any:
@@ -110,7 +110,7 @@ class TerminationManagerFacade(ManagerFacade):
         return self._manager.terminated | self._manager.time_outs
 
     def get_term(self, name: str) -> Tensor:
-        """Return where a term fired in this step. (num_envs,) bool"""
+        """Return where the termination `name` ended the episode in this step. (num_envs,) bool"""
         fired = self._manager.fired
         if name not in fired:
             raise NameProblem(f"no termination '{name}'; terminations: {listing(fired)}")
@@ -121,7 +121,7 @@ class CommandManagerFacade(ManagerFacade):
     """Command manager with Isaac Lab's attributes."""
 
     def get_command(self, name: str) -> Tensor:
-        """Return the current command. (num_envs, k)"""
+        """Return the current command of the term `name`. (num_envs, k)"""
         return _find_term(self._manager.terms, name, "command").command
 
     def get_term(self, name: str) -> Any:
@@ -133,7 +133,7 @@ class CommandManagerFacade(ManagerFacade):
 class BuiltinCommand:
     """Command term of rlcli in place of Isaac Lab's `CommandTerm`, for example a velocity command.
 
-    Its attributes can be read; one that rlcli's term does not have raises an error with a hint.
+    Reading an attribute that rlcli's term does not have raises a TaskError with a hint.
     """
 
     def __init__(self, term: Any) -> None:
@@ -156,7 +156,7 @@ class RewardManagerFacade(ManagerFacade):
         self._tunable = tunable
 
     def get_term_cfg(self, name: str) -> Any:
-        """Return the settings of a term. An assigned weight takes effect in the next step."""
+        """Return the settings of the reward `name`. A weight that is assigned to them takes effect in the next step."""
         found = {term.name: term for term in self._manager.terms}
         if name not in found:
             raise NameProblem(f"no reward '{name}'", did_you_mean(name, found) or f"rewards: {listing(found)}")
@@ -168,7 +168,7 @@ class RewardManagerFacade(ManagerFacade):
         return {term.name: row for term, row in zip(self._manager.terms, self._manager._sums, strict=True)}
 
     def set_term_cfg(self, name: str, cfg: Any) -> None:
-        """Set the weight of a term to `cfg.weight`."""
+        """Set the weight of the reward `name` to `cfg.weight`; other settings are not changed."""
         self.get_term_cfg(name).weight = cfg.weight
 
 

@@ -36,7 +36,7 @@ class SceneEntityCfg:
     preserve_order: bool = False
 
     def resolve(self, scene: Any) -> None:
-        """Resolve the names in a scene."""
+        """Set `joint_ids`, `body_ids` and the other indices from the names, in the scene of an environment."""
         scene.resolve(self)
 
 
@@ -127,7 +127,7 @@ class CommandTermCfg:
 
 
 class ManagerTermBase:
-    """Base class of terms with a state, made as `Name(cfg, env)` and called as `term(env, **parameters)`."""
+    """Base class of terms with a state, created as `Name(cfg, env)` and called as `term(env, **parameters)`."""
 
     def __init__(self, cfg: Any, env: Any) -> None:
         self.cfg = cfg
@@ -147,7 +147,7 @@ class ManagerTermBase:
         """Reset the state of environments (None: all) at the start of their episodes."""
 
     def __call__(self, env: Any, *args: Any, **params: Any) -> Any:
-        """Return the term's value."""
+        """Return the term's value in all environments, (num_envs,) or (num_envs, k); None for events."""
         raise NotImplementedError
 
 
@@ -185,7 +185,7 @@ class ActionTerm(ManagerTermBase):
         raise NotImplementedError(f"class {type(self).__name__} has no method apply_actions; implement it")
 
     def set_debug_vis(self, debug_vis: bool) -> bool:
-        """Do nothing: actions are not shown. Returns False."""
+        """Do nothing, because actions are not drawn; return False."""
         return False
 
 
@@ -198,7 +198,7 @@ class CommandTerm(ManagerTermBase):
         self.command_counter = torch.zeros(env.num_envs, dtype=torch.long, device=env.device)
 
     rlcli_name: str
-    """Name of the term."""
+    """Name of the term in the task, which rlcli sets."""
 
     @property
     def command(self) -> Tensor:
@@ -220,11 +220,14 @@ class CommandTerm(ManagerTermBase):
         return {}
 
     def set_debug_vis(self, debug_vis: bool) -> bool:
-        """Do nothing: commands are not shown. Returns False."""
+        """Do nothing, because the user's own commands are not drawn; return False."""
         return False
 
     def _resample(self, env_ids: Any) -> None:
-        """Sample new commands now; `_update_command` may call this method before the resampling time is over."""
+        """Sample new commands for the environments `env_ids` now.
+
+        `_update_command` may call this method before the resampling time is over.
+        """
         self._resample_command(env_ids)
         self.command_counter[env_ids] += 1
 
@@ -232,7 +235,7 @@ class CommandTerm(ManagerTermBase):
         """Update the metrics, once per step, before commands are resampled."""
 
     def _resample_command(self, env_ids: Any) -> None:
-        """Sample new commands for some environments."""
+        """Sample new commands for the environments `env_ids`."""
         raise NotImplementedError
 
     def _update_command(self) -> None:

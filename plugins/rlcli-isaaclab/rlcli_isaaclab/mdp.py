@@ -41,7 +41,11 @@ class MdpFunction:
         return f"mdp.{self.__name__}"
 
     def __call__(self, env: Any, *args: Any, **params: Any) -> Any:
-        """Return the term's value."""
+        """Return the value of the built-in term for the parameters of Isaac Lab's term.
+
+        Raises:
+            TypeError: if the term has a state or changes the simulation.
+        """
         section, builtin_name = find_term(self.__name__)
         signature = builtin_terms(section)[builtin_name]
         if signature.is_class or section == "events":
@@ -98,7 +102,7 @@ def _elements(
 
 
 class SensorPart:
-    """Contact sensor reduced to some of its bodies."""
+    """Contact sensor whose tensors have only the columns of some of its bodies."""
 
     def __init__(self, whole: Any, ids: Any) -> None:
         self._whole, self._ids = whole, ids
@@ -126,7 +130,19 @@ def find_term(name: str) -> tuple[str, str]:
 def _randomize_prop_by_op(
     data: Tensor, distribution_parameters: Any, dim_0_ids: Any, dim_1_ids: Any, operation: str, distribution: str
 ) -> Tensor:
-    """Sample new values for some rows and columns of `data`, in place; the user's own events call this function."""
+    """Change some rows and columns of `data` in place to sampled values; return `data`. The user's events call this.
+
+    Args:
+        data: values to change. (rows, columns)
+        distribution_parameters: low and high, or mean and standard deviation.
+        dim_0_ids: indices of the rows; None: all rows.
+        dim_1_ids: indices or slice of the columns.
+        operation: `add`, `scale` or `abs`, which replaces the old value.
+        distribution: `uniform`, `log_uniform` or `gaussian`.
+
+    Raises:
+        NotImplementedError: for another operation or distribution.
+    """
     samplers: dict[str, Any] = {
         "uniform": sample_uniform,
         "log_uniform": sample_log_uniform,

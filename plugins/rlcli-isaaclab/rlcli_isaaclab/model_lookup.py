@@ -124,7 +124,7 @@ def mjcf_of(usd: str, root: Path, given: Mapping[str, str], entity: str) -> str:
 
 
 def is_end_of(end: str, path: str) -> bool:
-    """Return whether a path ends with these folders and file, `folder/robot.usd`."""
+    """Return whether a path ends with the folders and the file of `end`, such as `folder/robot.usd`."""
     return f"/{path}".replace("\\", "/").endswith(f"/{end.lstrip('/')}")
 
 

@@ -37,7 +37,7 @@ class Thruster:
         self.reset(slice(None))
 
     def reset(self, env_ids: Any) -> None:
-        """Sample time and thrust constants of the rotors in some environments, and set their initial speed."""
+        """Sample time and thrust constants in the environments `env_ids`, and set the rotors to their initial speed."""
         cfg = self.cfg
         shape = self.tau_inc_s[env_ids].shape
         for target, ends in (
@@ -49,7 +49,7 @@ class Thruster:
         self.curr_thrust[env_ids] = self.thrust_const[env_ids] * self._start_speed[env_ids].square()
 
     def compute(self, target: Tensor) -> Tensor:
-        """Advance the rotors by one physics step. Return the thrusts. (num_envs, rotors) [N]"""
+        """Advance the rotors by one physics step to thrust targets; return the thrusts. (num_envs, rotors) [N] each"""
         low, high = self.cfg.thrust_range
         target = target.clamp(low, high)
         falls = self.curr_thrust.sign() * (target - self.curr_thrust).sign() < 0
@@ -102,13 +102,13 @@ class Multirotor(Asset):
             self.actuators[group] = made(cfg, names, ids, self.num_instances, self.device, start)
 
     def set_thrust_target(self, target: Tensor, thruster_ids: Any = None, env_ids: Any = None) -> None:
-        """Set thrust targets. (rows, thrusters) [N]"""
+        """Set thrust targets of thrusters in the environments `env_ids`; None: of all. (rows, thrusters) [N]"""
         rows = torch.arange(self.num_instances) if env_ids is None else torch.as_tensor(env_ids)
         columns = torch.arange(self.num_thrusters)[slice(None) if thruster_ids is None else thruster_ids]
         self.data.thrust_target[rows[:, None], columns] = target
 
     def reset(self, env_ids: Any = None) -> None:
-        """Reset the thrusters of some environments."""
+        """Reset the thrusters in the environments `env_ids`; None: in all environments."""
         super().reset(env_ids)
         rows = slice(None) if env_ids is None else env_ids
         # as in Isaac Lab, the first target is the speed

@@ -44,7 +44,7 @@ class ObjectReader:
                     self.driven_joints.setdefault(entity, {})[joint] = command
 
     def read_action(self, node: Node) -> dict[str, Any]:
-        """Return the settings of an action term of rlcli."""
+        """Return the settings of rlcli's action term for the settings of Isaac Lab's (`node`)."""
         kind = kind_of(node.get("class_type"))
         action = find_action(node.data.get("class_type"))
         name = ACTIONS.get(kind)

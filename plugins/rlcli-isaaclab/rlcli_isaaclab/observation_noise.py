@@ -15,7 +15,7 @@ class NoNoise:
     """Noise model without noise."""
 
     def __call__(self, data: Tensor) -> Tensor:
-        """Return the observation `data` unchanged. (num_envs, d)"""
+        """Return the observations or actions `data` unchanged. (num_envs, d)"""
         return data
 
     def reset(self, env_ids: Any) -> None:
@@ -23,7 +23,15 @@ class NoNoise:
 
 
 def noise_model(cfg: Any, managed: Any) -> Any:
-    """Return the noise model for a configuration; `cfg` None: `NoNoise`."""
+    """Return the noise model for a configuration, a callable (num_envs, d) -> (num_envs, d); for None `NoNoise`.
+
+    Args:
+        cfg: configuration of the noise model, such as `NoiseModelCfg`; or None.
+        managed: environment of rlcli.
+
+    Raises:
+        TaskError: if rlcli has no such noise model.
+    """
     if cfg is None:
         return NoNoise()
     kind = kind_of(cfg.class_type)

@@ -15,7 +15,7 @@ _RANDOM = ("noise", "bias", "delay")
 def fit_groups(
     sets: Mapping[str, Any], agent: dict[str, Any], observations: Mapping[str, Any], notes: list[Note]
 ) -> None:
-    """Change an agent (`critic_obs`, and its changes of the task) so that it reads the groups of `obs_groups`.
+    """Set the keys `critic_obs` and `task` of an agent, so that its networks read the groups of `obs_groups`.
 
     rlcli's actor reads only the group `policy`. If `obs_groups` gives the actor other groups as well, their terms are
     added to `policy`.

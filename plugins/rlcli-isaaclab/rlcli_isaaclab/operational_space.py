@@ -73,7 +73,17 @@ class OperationalSpaceController:
         current_ee_pose_b: Tensor | None = None,
         current_task_frame_pose_b: Tensor | None = None,
     ) -> None:
-        """Set targets and gains from a command (num_envs, action_dim). Poses are (num_envs, 7)."""
+        """Set the targets and gains of the controller from a command.
+
+        Args:
+            command: targets in the order of `target_types`, then stiffnesses and damping ratios if the impedance mode
+                has them. (num_envs, action_dim)
+            current_ee_pose_b: present pose of the controlled frame, root frame. (num_envs, 7) [m, (w, x, y, z)]
+            current_task_frame_pose_b: pose of the frame in which targets are given, root frame; None: the root frame.
+
+        Raises:
+            ValueError: if the command has another shape, or a relative target has no present pose.
+        """
         if command.shape != (self.num_envs, self.action_dim):
             raise ValueError(f"a command has shape {tuple(command.shape)}; pass {(self.num_envs, self.action_dim)}")
         if self.cfg.impedance_mode != "fixed":
@@ -119,7 +129,10 @@ class OperationalSpaceController:
     ) -> Tensor:
         """Return the efforts of the k joints, from the Jacobian of the controlled frame and the present state.
 
-        Everything is in the root's frame. jacobian_b (num_envs, 6, k) -> (num_envs, k) [N or N m]
+        All vectors are in the root's frame. jacobian_b (num_envs, 6, k) -> (num_envs, k) [N or N m]
+
+        Raises:
+            ValueError: if an argument that the settings of the controller need is None.
         """
         efforts = torch.zeros(self.num_envs, jacobian_b.shape[2], device=self._device)
         inverse = inertia = None
@@ -171,7 +184,7 @@ class OperationalSpaceController:
         return torch.cat(parts, dim=1)
 
     def _inertia(self, jacobian: Tensor, inverse: Tensor) -> Tensor:
-        """Return the inertia in operational space, with or without the coupling of translation and rotation."""
+        """Return the inertia in operational space, with or without coupling of translation and rotation. (n, 6, 6)"""
         if not self.cfg.partial_inertial_dynamics_decoupling:
             return torch.linalg.inv(jacobian @ inverse @ jacobian.mT)
         blocks = torch.zeros(self.num_envs, 6, 6, device=self._device)
@@ -264,13 +277,13 @@ class OperationalSpaceControllerAction(ActionTerm):
         return self._processed_actions
 
     def process_actions(self, actions: Tensor) -> None:
-        """Scale the action, and set it as the target."""
+        """Scale the policy's action, and set it as the command of the controller. (num_envs, k)"""
         self._raw_actions[:] = actions
         self._processed_actions[:] = actions * self._factors
         self._osc.set_command(self._processed_actions, self._ee_pose()[0])
 
     def apply_actions(self) -> None:
-        """Write the efforts of the next physics step."""
+        """Compute the joint efforts of the next physics step, and set them as targets of the joints."""
         data, view = self._asset.data, self._asset.root_physx_view
         root = data.root_quat_w
         pose, body = self._ee_pose()
@@ -311,7 +324,7 @@ class OperationalSpaceControllerAction(ActionTerm):
         return torch.cat(pose, dim=1), quat
 
     def reset(self, env_ids: Any = None) -> None:
-        """Set the raw actions to zero."""
+        """Set the raw actions of the environments `env_ids` to zero; None: of all environments."""
         self._raw_actions[slice(None) if env_ids is None else env_ids] = 0.0
 
 

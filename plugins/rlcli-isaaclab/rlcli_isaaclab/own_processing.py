@@ -24,9 +24,9 @@ def is_own(function: Any) -> bool:
 
 
 def take_own_processing(node: Node) -> tuple[int, bool]:
-    """Return the number of modifiers, and whether noise, that `ProcessedTerm` must apply. They are removed from `node`.
+    """Return (number of modifiers, whether noise) that `ProcessedTerm` must apply; remove these keys from `node`.
 
-    Noise acts after the modifiers, so that noise of the task takes all modifiers with it.
+    Noise acts after the modifiers. So if the noise is the task's own, `ProcessedTerm` applies all modifiers too.
     """
     found, modifiers = node.data.get("noise"), node.data.get("modifiers") or []
     noise: dict[str, Any] = found if isinstance(found, dict) else {}
@@ -47,16 +47,17 @@ def take_own_processing(node: Node) -> tuple[int, bool]:
 
 
 def call_once_per_step(managed: Any, holders: list[Any], function: Callable[[], Tensor]) -> Tensor:
-    """Call an observation; if it is one call more for a step, restore the state of the objects `holders` afterwards.
+    """Call an observation function and return its value; an additional call in a step does not change any state.
 
-    Such a call is that for the last observation of an episode, or for that of a restored checkpoint.
+    Additional calls compute the last observation of an episode, or the observation of a restored checkpoint. After such
+    a call the state of the objects `holders` is restored.
     """
     manager = getattr(managed, "observation_manager", None)
     return call_without_effects(holders, function) if getattr(manager, "repeats_calls", False) else function()
 
 
 class ProcessedTerm:
-    """Observation term whose value passes modifiers and noise of the task.
+    """Observation term that applies the task's own modifiers and noise to the value of another term.
 
     Args:
         inner: the term that computes the value: the name of a built-in one, or a `UserTerm`.

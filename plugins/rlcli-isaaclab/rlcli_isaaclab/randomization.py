@@ -65,7 +65,7 @@ class EventParameters:
         return pair if self.params.data.get("distribution") == "gaussian" else sorted(pair)
 
     def entity(self) -> TermConfig:
-        """Return the parameter `entity` of rlcli's term; empty for the robot, which is the default."""
+        """Return {"entity": name} for rlcli's term; empty if the entity is `robot`, which is the default."""
         return {} if self.name == "robot" else {"entity": self.name}
 
     def selected(self, kind: str) -> list[str] | None:
@@ -95,7 +95,7 @@ class EventParameters:
         }
 
     def ignore(self, name: str, why: str) -> None:
-        """Report that a parameter has no counterpart, if it is set."""
+        """Report a parameter as ignored for the reason `why`, if the parameter is set."""
         value = self.params.data.get(name)
         if value is not None and any(value if isinstance(value, list | tuple) else [value]):
             self.params.report.entries[(*self.params.key, name)] = ("ignored", why)

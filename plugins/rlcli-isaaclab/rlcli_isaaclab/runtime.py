@@ -190,11 +190,17 @@ class ManagerBasedRLEnv(gymnasium.Env):
         return gymnasium.vector.utils.batch_space(self.single_observation_space, self.managed.num_envs)
 
     def reset(self, *, seed: int | None = None, options: Any = None, env_ids: Any = None) -> Any:
-        """Reset all environments. Return the observations by group, and `extras`, a dict of values to log."""
+        """Reset all environments. Return (observations by group, `extras`, a dict of values to log).
+
+        `options` and `env_ids` have no effect.
+        """
         return self.managed.reset(seed), self.extras
 
     def step(self, action: Tensor) -> Any:
-        """Step all environments. Return observations by group, reward, terminated, truncated and `extras`."""
+        """Step all environments with actions (num_envs, a).
+
+        Return (observations by group, reward, terminated, truncated, `extras`), with (num_envs,) for the three tensors.
+        """
         result = self.managed.step(action.to(self.managed.device))
         if result.episodes is not None:
             ended = result.episodes.ended()
@@ -209,7 +215,7 @@ class ManagerBasedRLEnv(gymnasium.Env):
         """Do nothing; use `rlcli play --video` instead."""
 
     def close(self) -> None:
-        """Close the engine."""
+        """Free the threads and the memory of the simulation."""
         self.managed.close()
 
     def use(self, context: Any) -> None:

@@ -23,7 +23,11 @@ from rlcli_isaaclab.setup_scene import current_setup
 
 
 class Asset:
-    """A robot or object of the scene, with the attributes and methods of Isaac Lab's assets."""
+    """A robot or object of the scene, with the attributes and methods of Isaac Lab's assets.
+
+    In all methods, `env_ids` are the environments of the rows of a tensor, and `joint_ids` the joints of its columns;
+    None means all of them.
+    """
 
     def __init__(self, cfg: Any) -> None:
         current_setup().add(self, cfg)
@@ -39,7 +43,7 @@ class Asset:
     cfg: Any
 
     def bind(self, env: VecEnv, entity: Entity) -> None:
-        """Let the asset read and write an entity of the simulation."""
+        """Connect the asset with the entity of the simulation that it reads and writes."""
         self._env, self._entity = env, entity
         self._drives: dict[str, JointDrive] = {}
         self._wrench = BodyWrench(env, entity)
@@ -79,7 +83,10 @@ class Asset:
     def set_external_force_and_torque(
         self, forces: Tensor, torques: Tensor, body_ids: Any = None, env_ids: Any = None, **frame: Any
     ) -> None:
-        """Apply forces [N] and torques [N m] to bodies, in their own frames, until they change. (rows, bodies, 3)"""
+        """Apply forces [N] and torques [N m] to bodies until the next call. (rows, bodies, 3) each
+
+        The vectors are in the frames of the bodies; with `is_global=True` in `frame` they are in the world frame.
+        """
         self._wrench.set_forces_and_torques(forces, torques, body_ids=body_ids, env_ids=env_ids, **frame)
 
     def start_wrenches(self, by_task: bool = False) -> None:
@@ -301,7 +308,7 @@ class Scene(Mapping[str, Any]):
         """Do nothing: data are computed when they are read."""
 
     def reset(self, env_ids: Any = None) -> None:
-        """Remove forces on bodies."""
+        """Remove the forces on all bodies in the environments `env_ids`; None: in all environments."""
         for asset in self.articulations.values():
             asset.reset(env_ids)
 

@@ -81,7 +81,7 @@ class FrameTransformer:
 
     @property
     def target_quat_source(self) -> Tensor:
-        """Orientations of the target frames in the source frame. (num_envs, frames, 4)"""
+        """Orientations of the target frames (w, x, y, z) in the source frame. (num_envs, frames, 4)"""
         back = conjugate(self._pose(self._source)[1])
         return torch.stack([multiply(back, self._pose(t)[1]) for t in self._targets], dim=1)
 
@@ -273,7 +273,7 @@ class Sensor:
 
     @property
     def quat_w(self) -> Tensor:
-        """Orientation of the body with the rays, world frame. (num_envs, 4)"""
+        """Orientation of the body that carries the rays (w, x, y, z), world frame. (num_envs, 4)"""
         quat: Tensor = self._sensor._pose()[1]
         return quat
 
@@ -298,11 +298,11 @@ class Sensor:
         return find_elements(name_keys, self.body_names, self.body_names, "body", preserve_order)
 
     def compute_first_contact(self, dt: float, abs_tol: float = 1e-8) -> Tensor:
-        """Return for each body whether a contact began in this step. (num_envs, bodies) bool"""
+        """Return for each body whether a contact began in this step; the arguments are not used. (n, bodies) bool"""
         return self._sensor.first_contact
 
     def compute_first_air(self, dt: float, abs_tol: float = 1e-8) -> Tensor:
-        """Return for each body whether its contact ended in this step. (num_envs, bodies) bool"""
+        """Return for each body whether its contact ended in this step; the arguments are not used. (n, bodies) bool"""
         return self._sensor.first_air
 
 

@@ -92,7 +92,11 @@ def create_prim(
     usd_path: str | None = None,
     **other: Any,
 ) -> None:
-    """Record the USD file of a new prim. A prim that only groups other prims needs no record: then do nothing."""
+    """Record a new prim with a USD file in the running `Setup`; do nothing for a prim that only groups other prims.
+
+    Raises:
+        TaskError: for a prim of another type, which rlcli does not have.
+    """
     if usd_path is not None:
         from rlcli_isaaclab.sim import UsdFileCfg
 

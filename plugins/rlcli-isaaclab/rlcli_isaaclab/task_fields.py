@@ -51,7 +51,10 @@ def set_own_fields(cfg: Any, values: Mapping[str, Any]) -> None:
 
 
 def set_valid_fields(cfg: Any, base: type, values: Mapping[tuple[str, ...], Any]) -> None:
-    """Set the fields that have a value of the right type at `("params", NAME, ...)`; the others are reported later."""
+    """Set the fields that have a value of the right type at the path `("params", NAME, ...)`.
+
+    rlcli reports other values when it checks the task.
+    """
     for path, value in values.items():
         if path[0] != "params":
             continue

@@ -29,6 +29,9 @@ def load_cfg_from_registry(task_name: str, entry_point_key: str) -> Any:
     Args:
         task_name: id of the task, such as `Isaac-Cartpole-v0`.
         entry_point_key: key of the registration that names the configuration, such as `env_cfg_entry_point`.
+
+    Raises:
+        KeyError: if no task has the id, or the registration does not have the key.
     """
     from rlcli.registry.task_imports import load_object, registrations
 

@@ -170,7 +170,7 @@ class TermReader(ObjectReader):
         return self.scene.is_fixed(name) and not any(any(pair) for values in ranges for pair in values.values())
 
     def read_term(self, section: str, node: Node) -> dict[str, Any]:
-        """Return the settings of a term of rlcli: `func` and its parameters."""
+        """Return the settings of a term of rlcli: `func` and its parameters. Mistakes are added to the report."""
         function, params = node.require("func"), node.node("params")
         if isinstance(function, AbsentValue) or (isinstance(function, type) and hasattr(function, "absent_name")):
             reason, hint = reason_of(function.absent_name)

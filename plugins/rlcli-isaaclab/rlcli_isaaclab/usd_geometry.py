@@ -128,7 +128,11 @@ class _Mesh:
 
 
 def _triangles(model: mujoco.MjModel, geom: int) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Return the vertices of a geom in its own frame (n, 3) [m], and its faces (m, 3), indices of vertices."""
+    """Return the vertices of a geom in its own frame (n, 3) [m], and its faces (m, 3), indices of vertices.
+
+    Raises:
+        TaskError: for a geom of another type, such as a plane.
+    """
     kind, size = int(model.geom_type[geom]), model.geom_size[geom]
     types = mujoco.mjtGeom
     if kind == types.mjGEOM_MESH:

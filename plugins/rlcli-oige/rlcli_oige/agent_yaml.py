@@ -20,8 +20,11 @@ class Agent:
     """Settings of the trainer `ppo`, and the position of each setting in the train YAML."""
 
     data: dict[str, Any]
+    """Settings by key."""
     origin: Callable[[Path], Origin]
+    """Function from the path of a setting to its file and line in the train YAML."""
     notes: list[Note]
+    """How each key of the train YAML was translated."""
 
     def origin_at(self, at: Path) -> Callable[[Path], Origin]:
         """Return a function from a path in the task, below `at`, to file and line of the setting in the train YAML."""

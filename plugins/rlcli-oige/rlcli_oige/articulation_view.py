@@ -114,7 +114,7 @@ class ArticulationView(XFormPrimView):
         self._target("velocity", self._velocity_targets, rows, columns, values)
 
     def set_joint_position_targets(self, positions: Any, indices: Any = None, joint_indices: Any = None) -> None:
-        """Set the targets of position drives. They hold until set again. (n, k) [m or rad]
+        """Set the targets of position drives, which act until the next call. (n, k) [m or rad]
 
         Raises:
             TaskError: if no joint of the model has a position actuator.
@@ -123,7 +123,7 @@ class ArticulationView(XFormPrimView):
         self._target("position", self._position_targets, *self._broadcast(positions, indices, joint_indices))
 
     def set_joint_velocity_targets(self, velocities: Any, indices: Any = None, joint_indices: Any = None) -> None:
-        """Set the targets of velocity drives. They hold until set again. (n, k) [m/s or rad/s]
+        """Set the targets of velocity drives, which act until the next call. (n, k) [m/s or rad/s]
 
         Raises:
             TaskError: if no joint of the model has a velocity actuator.
@@ -132,7 +132,7 @@ class ArticulationView(XFormPrimView):
         self._target("velocity", self._velocity_targets, *self._broadcast(velocities, indices, joint_indices))
 
     def set_joint_efforts(self, efforts: Any, indices: Any = None, joint_indices: Any = None) -> None:
-        """Set efforts on the joints, limited by their motors. They hold until set again. (n, k) [N or N m]"""
+        """Set efforts on the joints, which act until the next call, within the motors' limits. (n, k) [N or N m]"""
         rows, columns, values = self._broadcast(efforts, indices, joint_indices)
         self._target("motor", self._efforts, rows, columns, values)
         if len(self._without_motor):  # these joints have drives, not motors: the effort is added to that of the drive
@@ -145,7 +145,7 @@ class ArticulationView(XFormPrimView):
             field[rows[:, None], dofs] = efforts.to(field.dtype)
 
     def apply_action(self, control_actions: Any, indices: Any = None) -> None:
-        """Set targets and efforts from an `ArticulationAction`."""
+        """Set targets and efforts from an `ArticulationAction`; a value that is None there is not changed."""
         joints = getattr(control_actions, "joint_indices", None)
         for name, setter in (
             ("joint_positions", self.set_joint_position_targets),
@@ -157,15 +157,15 @@ class ArticulationView(XFormPrimView):
                 setter(values, indices, joints)
 
     def get_applied_joint_efforts(self, indices: Any = None, joint_indices: Any = None, clone: bool = True) -> Tensor:
-        """Return the efforts set by the task. (n, k) [N or N m]"""
+        """Return the efforts that the task has set, before limits. (n, k) [N or N m]"""
         return self._select(self._efforts, indices, joint_indices)
 
     def get_joint_position_targets(self, indices: Any = None, joint_indices: Any = None) -> Tensor:
-        """Return the position targets. (n, k) [m or rad]"""
+        """Return the position targets that the task has set; 0 before the first call. (n, k) [m or rad]"""
         return self._select(self._position_targets, indices, joint_indices)
 
     def get_measured_joint_efforts(self, indices: Any = None, joint_indices: Any = None, clone: bool = True) -> Tensor:
-        """Return the actuators' efforts in the last substep, after limits. (n, k) [N or N m]"""
+        """Return the efforts of the actuators in the last physics step, after limits. (n, k) [N or N m]"""
         return self._select(self.entity.data.applied_effort[:, self._order], indices, joint_indices)
 
     def get_measured_joint_forces(self, indices: Any = None, joint_indices: Any = None, clone: bool = True) -> Tensor:
@@ -181,7 +181,7 @@ class ArticulationView(XFormPrimView):
         return select_rows(wrench if columns is None else wrench[:, columns], self._index(indices))
 
     def get_force_sensor_forces(self, indices: Any = None, joint_indices: Any = None, clone: bool = True) -> Tensor:
-        """Return force and torque between each body and its parent, exactly as `get_measured_joint_forces`."""
+        """Return the result of `get_measured_joint_forces` for the same arguments. (n, bodies, 6) [N, N m]"""
         return self.get_measured_joint_forces(indices, joint_indices)
 
     def get_dof_limits(self) -> Tensor:
@@ -220,13 +220,13 @@ class ArticulationView(XFormPrimView):
         bias[:, actuators, 2] = -damping[:, joints].to(bias.dtype)
 
     def get_body_masses(self, indices: Any = None, body_indices: Any = None, clone: bool = True) -> Tensor:
-        """Return masses, breadth first. (n, bodies) [kg]"""
+        """Return the masses of the bodies, in the order of `body_names`. (n, bodies) [kg]"""
         masses = self.env.engine.expand("body_mass")[:, self._body_ids].float()
         columns = self._index(body_indices)
         return select_rows(masses if columns is None else masses[:, columns], self._index(indices))
 
     def set_body_masses(self, values: Any, indices: Any = None, body_indices: Any = None) -> None:
-        """Set masses; inertias are scaled in proportion. (n, bodies) [kg]"""
+        """Set the masses of bodies, and scale their inertias by the same factors. (n, bodies) [kg]"""
         engine = self.env.engine
         mass, inertia = engine.expand("body_mass"), engine.expand("body_inertia")
         ids = torch.tensor(self._body_ids, device=self.env.device)
@@ -246,7 +246,10 @@ class ArticulationView(XFormPrimView):
         self, stiffnesses: Any = None, dampings: Any = None, limit_stiffnesses: Any = None, limits: Any = None,
         rest_lengths: Any = None, offsets: Any = None, indices: Any = None,
     ) -> None:  # fmt: skip
-        """Set stiffness and damping of the tendons. (tendons,) or (n, tendons) [N/m, N s/m]"""
+        """Set stiffness and damping of the tendons. (tendons,) or (n, tendons) [N/m, N s/m]
+
+        The other properties have no effect, because the MJCF sets them; they are logged as not simulated.
+        """
         tendons, rows = self._tendons(), self._env_rows(indices)[:, None]
         for name, values in (("tendon_stiffness", stiffnesses), ("tendon_damping", dampings)):
             if values is not None and tendons:

@@ -1,4 +1,4 @@
-"""Cameras of tasks with image observations: the parts of Omniverse's replicator that they use."""
+"""Cameras of tasks with image observations: the parts of Omniverse's replicator that such tasks use."""
 
 from __future__ import annotations
 
@@ -127,13 +127,13 @@ class Camera(Counterpart):
         self._focal_length = _FOCAL_LENGTH / 10.0
 
     def set_clipping_range(self, near_distance: float | None = None, far_distance: float | None = None) -> None:
-        """Set the distances between which the camera sees [m]."""
+        """Set the smallest and the largest distance of objects that the camera renders [m]; None: unchanged."""
         near, far = self.get_clipping_range()
         given = (near if near_distance is None else near_distance, far if far_distance is None else far_distance)
         self._prim.GetAttribute("clippingRange").value = given
 
     def get_clipping_range(self) -> tuple[float, float]:
-        """Return the distances between which the camera sees [m]."""
+        """Return the smallest and the largest distance of objects that the camera renders [m]."""
         near, far = _value(self._prim, "clippingRange", (0.01, 1e3))
         return float(near), float(far)
 

@@ -214,7 +214,7 @@ class OigeEnv(DirectEnv):
         return self.grid
 
     def step_inside_action(self) -> None:
-        """Simulate one physics step inside of `pre_physics_step`."""
+        """Simulate one physics step of all environments, for a task that steps the simulation in `pre_physics_step`."""
         self.engine.step(1)
         self.sim.refresh()
         self._steps_inside += 1
@@ -295,7 +295,7 @@ class OigeEnv(DirectEnv):
     def _split_reset_flags(self) -> tuple[Tensor, Tensor]:
         """Split `reset_buf` of the task; return where the episode is terminated and where it is truncated.
 
-        Both are (num_envs,) bool. How they are told apart is described in `RLTask`.
+        Both are (num_envs,) bool. The docstring of `RLTask` has the rule.
         """
         task = self.task
         done = task.reset_buf != 0

@@ -9,7 +9,7 @@ from torch import Tensor
 
 
 def set_seed(seed: int, torch_deterministic: bool = False) -> int:
-    """Seed torch, numpy and random. -1 chooses a random seed. Returns the seed."""
+    """Seed torch, numpy and random, and return the seed. The seed -1 chooses a random one."""
     if seed == -1:
         seed = 42 if torch_deterministic else int(np.random.randint(0, 10000))
     random.seed(seed)
@@ -19,47 +19,47 @@ def set_seed(seed: int, torch_deterministic: bool = False) -> int:
 
 
 def normalize(x: Tensor, eps: float = 1e-9) -> Tensor:
-    """Scale vectors to length 1. (..., k)"""
+    """Return vectors scaled to length 1; a vector of length 0 stays 0. (..., k)"""
     return x / x.norm(p=2, dim=-1).clamp(min=eps, max=None).unsqueeze(-1)
 
 
 def tensor_clamp(t: Tensor, min_t: Tensor, max_t: Tensor) -> Tensor:
-    """Clamp each element between the elements of two tensors."""
+    """Return t with each element clamped between those of `min_t` and `max_t`."""
     return torch.max(torch.min(t, max_t), min_t)
 
 
 def scale(x: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
-    """Map [-1, 1] to [lower, upper]."""
+    """Return x mapped linearly from [-1, 1] to [lower, upper]."""
     return 0.5 * (x + 1.0) * (upper - lower) + lower
 
 
 def unscale(x: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
-    """Map [lower, upper] to [-1, 1]."""
+    """Return x mapped linearly from [lower, upper] to [-1, 1]."""
     return (2.0 * x - upper - lower) / (upper - lower)
 
 
 def scale_transform(x: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
-    """Map [lower, upper] to [-1, 1], like `unscale`."""
+    """Return x mapped linearly from [lower, upper] to [-1, 1], as `unscale` does."""
     return unscale(x, lower, upper)
 
 
 def unscale_transform(x: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
-    """Map [-1, 1] to [lower, upper], like `scale`."""
+    """Return x mapped linearly from [-1, 1] to [lower, upper], as `scale` does."""
     return scale(x, lower, upper)
 
 
 def unscale_np(x, lower, upper):
-    """Map [lower, upper] to [-1, 1], for numpy arrays."""
+    """Return a numpy array x mapped linearly from [lower, upper] to [-1, 1]."""
     return (2.0 * x - upper - lower) / (upper - lower)
 
 
 def scale_np(x, lower, upper):
-    """Map [-1, 1] to [lower, upper], for numpy arrays."""
+    """Return a numpy array x mapped linearly from [-1, 1] to [lower, upper]."""
     return 0.5 * (x + 1.0) * (upper - lower) + lower
 
 
 def saturate(x: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
-    """Clamp each element between the elements of two tensors."""
+    """Return x with each element clamped between those of `lower` and `upper`."""
     return torch.max(torch.min(x, upper), lower)
 
 
@@ -69,7 +69,7 @@ def copysign(a: float, b: Tensor) -> Tensor:
 
 
 def torch_rand_float(lower: float, upper: float, shape: tuple[int, int], device: str) -> Tensor:
-    """Sample uniformly from [lower, upper)."""
+    """Return a tensor of this shape with uniform samples from [lower, upper)."""
     return (upper - lower) * torch.rand(*shape, device=device) + lower
 
 
@@ -80,17 +80,17 @@ def torch_random_dir_2(shape: tuple[int, int], device: str) -> Tensor:
 
 
 def normalize_angle(x: Tensor) -> Tensor:
-    """Wrap angles to [-pi, pi] [rad]."""
+    """Return the same angles in [-pi, pi] [rad]."""
     return torch.atan2(torch.sin(x), torch.cos(x))
 
 
 def deg2rad(x: Tensor) -> Tensor:
-    """Convert degrees to radians."""
+    """Return angles in radians for angles in degrees."""
     return x * (math.pi / 180.0)
 
 
 def rad2deg(x: Tensor) -> Tensor:
-    """Convert radians to degrees."""
+    """Return angles in degrees for angles in radians."""
     return x * (180.0 / math.pi)
 
 
@@ -100,12 +100,12 @@ def matmul(matrix_a: Tensor, matrix_b: Tensor) -> Tensor:
 
 
 def sin(data: Tensor) -> Tensor:
-    """Return the sine."""
+    """Return the sine of each element [rad]."""
     return torch.sin(data)
 
 
 def cos(data: Tensor) -> Tensor:
-    """Return the cosine."""
+    """Return the cosine of each element [rad]."""
     return torch.cos(data)
 
 
@@ -115,22 +115,22 @@ def transpose_2d(data: Tensor) -> Tensor:
 
 
 def inverse(data: Tensor) -> Tensor:
-    """Return the inverse of a matrix."""
+    """Return the inverse of a matrix, or of a batch of matrices."""
     return torch.linalg.inv(data)
 
 
 def create_zeros_tensor(shape, dtype="float32", device=None) -> Tensor:
-    """Return a tensor of zeros."""
+    """Return a tensor of zeros of this shape."""
     return torch.zeros(tuple(shape), dtype=_dtype(dtype), device=device)
 
 
 def create_tensor_from_list(data, dtype="float32", device=None) -> Tensor:
-    """Return a list as a tensor."""
+    """Return a list of numbers as a new tensor."""
     return torch.tensor(data, dtype=_dtype(dtype), device=device)
 
 
 def as_type(data: Tensor, dtype) -> Tensor:
-    """Convert a tensor to another data type."""
+    """Return a tensor with another data type, such as "int32"."""
     return data.to(_dtype(dtype))
 
 
@@ -140,7 +140,7 @@ def convert(data, device=None, dtype="float32") -> Tensor:
 
 
 def move_data(data: Tensor, device: str) -> Tensor:
-    """Move a tensor to another device."""
+    """Return a tensor on another device."""
     return data.to(device)
 
 
@@ -150,32 +150,32 @@ def clone_tensor(data: Tensor, device=None) -> Tensor:
 
 
 def expand_dims(data: Tensor, axis: int) -> Tensor:
-    """Insert a dimension of size 1 at the position `axis`."""
+    """Return a tensor with a new dimension of size 1 at the position `axis`."""
     return torch.unsqueeze(data, axis)
 
 
 def tensor_cat(data, device=None, dim: int = -1) -> Tensor:
-    """Concatenate tensors along a dimension."""
+    """Return tensors or lists concatenated along a dimension."""
     return torch.cat([torch.as_tensor(item, device=device) for item in data], dim=dim)
 
 
 def tensor_stack(data, dim: int = 0) -> Tensor:
-    """Stack tensors along a new dimension."""
+    """Return tensors stacked along a new dimension."""
     return torch.stack(list(data), dim=dim)
 
 
 def to_list(data) -> list:
-    """Return data as a list."""
+    """Return a tensor or an array as nested lists."""
     return data if isinstance(data, list) else data.tolist()
 
 
 def to_numpy(data):
-    """Return data as a numpy array."""
+    """Return a tensor or a list as a numpy array."""
     return data.detach().cpu().numpy() if isinstance(data, Tensor) else np.asarray(data)
 
 
 def resolve_indices(indices, count: int, device=None) -> Tensor:
-    """Return indices as int64; all indices for None."""
+    """Return indices as an int64 tensor; for None the indices 0 to `count` - 1."""
     if indices is None:
         return torch.arange(count, device=device)
     return torch.as_tensor(indices, device=device).long()

@@ -77,9 +77,12 @@ class Randomizer:
         return self._parameters[self._check_path(path)]
 
     def set_dr_distribution_parameters(self, distribution_parameters: Any, *path: str) -> None:
-        """Replace `distribution_parameters` during the training.
+        """Replace the current `distribution_parameters`, from the next sample on.
 
         `path` is as in `get_initial_dr_distribution_parameters`.
+
+        Raises:
+            TaskError: if the YAML has no randomisation at the path.
         """
         self._parameters[self._check_path(path)] = np.asarray(distribution_parameters).tolist()
 
@@ -165,7 +168,7 @@ class Randomizer:
         return self._add_noise("actions", action.clone()) if self._noise["actions"] else action
 
     def add_observation_noise(self, obs: Tensor) -> None:
-        """Add noise to observations, in place."""
+        """Add the noise of `observations:` to the observations (num_envs, d), in place."""
         if self._noise["observations"]:
             self._add_noise("observations", obs)
 

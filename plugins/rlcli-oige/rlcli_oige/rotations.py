@@ -9,7 +9,7 @@ from rlcli_oige.maths import normalize, normalize_angle
 
 
 def quat_mul(a: Tensor, b: Tensor) -> Tensor:
-    """Return the Hamilton product: first rotation b, then rotation a. (..., 4)"""
+    """Return the Hamilton product: the rotation b followed by the rotation a. (..., 4) each"""
     aw, ax, ay, az = a[..., 0], a[..., 1], a[..., 2], a[..., 3]
     bw, bx, by, bz = b[..., 0], b[..., 1], b[..., 2], b[..., 3]
     return torch.stack(
@@ -29,29 +29,29 @@ def quat_conjugate(a: Tensor) -> Tensor:
 
 
 def quat_unit(a: Tensor) -> Tensor:
-    """Scale quaternions to length 1. (..., 4)"""
+    """Return quaternions scaled to length 1. (..., 4)"""
     return normalize(a)
 
 
 def quat_rotate(q: Tensor, v: Tensor) -> Tensor:
-    """Rotate a vector from the quaternion's frame to the parent frame. (n, 4), (n, 3) -> (n, 3)"""
+    """Return v, given in the frame of the orientation q, in the parent frame. (n, 4), (n, 3) -> (n, 3)"""
     axis = q[..., 1:]
     twice = 2.0 * torch.cross(axis, v, dim=-1)
     return v + q[..., :1] * twice + torch.cross(axis, twice, dim=-1)
 
 
 def quat_apply(a: Tensor, b: Tensor) -> Tensor:
-    """Rotate vectors, like `quat_rotate`; quaternions and vectors may have different dimensions. -> shape of b"""
+    """Return the vectors b rotated by the quaternions a, in the shape of b. (..., 4), (..., 3) -> (..., 3)"""
     return quat_rotate(a.reshape(-1, 4), b.reshape(-1, 3)).reshape(b.shape)
 
 
 def quat_rotate_inverse(q: Tensor, v: Tensor) -> Tensor:
-    """Rotate a vector from the parent frame to the quaternion's frame. (n, 4), (n, 3) -> (n, 3)"""
+    """Return v, given in the parent frame, in the frame of the orientation q. (n, 4), (n, 3) -> (n, 3)"""
     return quat_rotate(quat_conjugate(q), v)
 
 
 def quat_axis(q: Tensor, axis: int = 0) -> Tensor:
-    """Return an axis of the quaternion's frame in the parent frame. (n, 4) -> (n, 3)"""
+    """Return the axis with the number `axis` (0: x) of an orientation's frame, in the parent frame. (n, 4) -> (n, 3)"""
     basis = torch.zeros(q.shape[0], 3, device=q.device)
     basis[:, axis] = 1.0
     return quat_rotate(q, basis)
@@ -71,7 +71,7 @@ def quat_angle_axis(x: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def quat_to_angle_axis(q: Tensor) -> tuple[Tensor, Tensor]:
-    """Return angle and axis of a rotation, like `quat_angle_axis`, with the angle in [-pi, pi]."""
+    """Return the angle in [-pi, pi] [rad] and the axis of a rotation. (n, 4) -> (n,), (n, 3)"""
     angle, axis = quat_angle_axis(q)
     return normalize_angle(angle), axis
 
@@ -83,7 +83,10 @@ def quat_diff_rad(a: Tensor, b: Tensor) -> Tensor:
 
 
 def get_euler_xyz(q: Tensor, extrinsic: bool = True) -> tuple[Tensor, Tensor, Tensor]:
-    """Return roll, pitch and yaw in [0, 2 pi) [rad], around fixed axes, or around moving axes. (n,) each"""
+    """Return roll, pitch and yaw in [0, 2 pi) [rad]. (n, 4) -> (n,) each
+
+    With `extrinsic` the angles are around fixed axes, otherwise around moving axes.
+    """
     w, x, y, z = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
     if extrinsic:
         roll = torch.atan2(2.0 * (w * x + y * z), w * w - x * x - y * y + z * z)
@@ -98,7 +101,10 @@ def get_euler_xyz(q: Tensor, extrinsic: bool = True) -> tuple[Tensor, Tensor, Te
 
 
 def quat_from_euler_xyz(roll: Tensor, pitch: Tensor, yaw: Tensor, extrinsic: bool = True) -> Tensor:
-    """Return rotations around x, y and z [rad], around fixed axes or moving axes. (n,) each -> (n, 4)"""
+    """Return the quaternions of rotations around x, y and z [rad]. (n,) each -> (n, 4)
+
+    With `extrinsic` the angles are around fixed axes, otherwise around moving axes.
+    """
     zero = torch.zeros_like(roll)
     qx = torch.stack([torch.cos(roll / 2.0), torch.sin(roll / 2.0), zero, zero], dim=-1)
     qy = torch.stack([torch.cos(pitch / 2.0), zero, torch.sin(pitch / 2.0), zero], dim=-1)
@@ -147,22 +153,25 @@ def rot_matrices_to_quats(rotation_matrices: Tensor, device: str = "") -> Tensor
 
 
 def matrix_to_quaternion(matrix: Tensor) -> Tensor:
-    """Return the quaternions of rotation matrices, like `rot_matrices_to_quats`."""
+    """Return the quaternions of rotation matrices, with w >= 0, as `rot_matrices_to_quats` does. (n, 3, 3) -> (n, 4)"""
     return rot_matrices_to_quats(matrix)
 
 
 def xyzw2wxyz(q: Tensor, ret_torch: bool = True) -> Tensor:
-    """Change the order of a quaternion from (x, y, z, w) to (w, x, y, z)."""
+    """Return quaternions in the order (w, x, y, z) for quaternions in the order (x, y, z, w). (..., 4)"""
     return torch.roll(q, 1, -1)
 
 
 def wxyz2xyzw(q: Tensor, ret_torch: bool = True) -> Tensor:
-    """Change the order of a quaternion from (w, x, y, z) to (x, y, z, w)."""
+    """Return quaternions in the order (x, y, z, w) for quaternions in the order (w, x, y, z). (..., 4)"""
     return torch.roll(q, -1, -1)
 
 
 def slerp(q0: Tensor, q1: Tensor, fraction: Tensor) -> Tensor:
-    """Interpolate between two orientations along the shorter path. (n, 4), (n, 4), (n,) or (n, 1) -> (n, 4)"""
+    """Return the orientation at `fraction` (0 to 1) of the shorter path from q0 to q1. (n, 4), (n, 4), (n,) -> (n, 4)
+
+    `fraction` may also have the shape (n, 1).
+    """
     t = fraction.reshape(-1, 1)
     cosine = (q0 * q1).sum(dim=-1, keepdim=True)
     q1 = torch.where(cosine < 0.0, -q1, q1)
@@ -176,28 +185,28 @@ def slerp(q0: Tensor, q1: Tensor, fraction: Tensor) -> Tensor:
 
 
 def tf_inverse(q: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the inverse of a pose, rotation q and translation t. (..., 4), (..., 3)"""
+    """Return the inverse of a pose with the rotation q and the translation t. (..., 4), (..., 3)"""
     inverse = quat_conjugate(q)
     return inverse, -quat_rotate(inverse, t)
 
 
 def tf_apply(q: Tensor, t: Tensor, v: Tensor) -> Tensor:
-    """Return the point v, rotated by the quaternion q and moved by the vector t. (..., 3)"""
+    """Return the point v, rotated by the quaternion q and moved by the vector t. (n, 4), (n, 3), (n, 3) -> (n, 3)"""
     return quat_rotate(q, v) + t
 
 
 def tf_vector(q: Tensor, v: Tensor) -> Tensor:
-    """Return the direction v, rotated by the quaternion q; t is not used. (..., 3)"""
+    """Return the vector v, rotated by the quaternion q. (n, 4), (n, 3) -> (n, 3)"""
     return quat_rotate(q, v)
 
 
 def tf_combine(q1: Tensor, t1: Tensor, q2: Tensor, t2: Tensor) -> tuple[Tensor, Tensor]:
-    """Combine two transforms: first the second, then the first."""
+    """Return the transform (q2, t2) followed by the transform (q1, t1). (n, 4), (n, 3) each"""
     return quat_mul(q1, q2), quat_rotate(q1, t2) + t1
 
 
 def get_basis_vector(q: Tensor, v: Tensor) -> Tensor:
-    """Rotate a vector, like `quat_rotate`."""
+    """Return the vector v rotated by the quaternion q, as `quat_rotate` does. (n, 4), (n, 3) -> (n, 3)"""
     return quat_rotate(q, v)
 
 
@@ -210,18 +219,18 @@ def get_axis_params(value, axis_idx: int, x_value=0.0, dtype=float, n_dims: int 
 
 
 def angle_axis_to_exp_map(angle: Tensor, axis: Tensor) -> Tensor:
-    """Return the rotation vector of an angle [rad] around an axis. (n, 3)"""
+    """Return the rotation vector, the axis times the angle [rad]. (n,), (n, 3) -> (n, 3)"""
     return angle.unsqueeze(-1) * axis
 
 
 def quat_to_exp_map(q: Tensor) -> Tensor:
-    """Return the rotation vector of a quaternion [rad]. (n, 4) -> (n, 3)"""
+    """Return the rotation vector of a quaternion, its axis times its angle [rad]. (n, 4) -> (n, 3)"""
     angle, axis = quat_to_angle_axis(q)
     return angle_axis_to_exp_map(angle, axis)
 
 
 def exp_map_to_quat(exp_map: Tensor) -> Tensor:
-    """Return the quaternion of a rotation vector [rad]. (n, 3) -> (n, 4)"""
+    """Return the quaternion of a rotation vector, an axis times an angle [rad]. (n, 3) -> (n, 4)"""
     angle = torch.norm(exp_map, p=2, dim=-1)
     return quat_from_angle_axis(angle, exp_map)
 

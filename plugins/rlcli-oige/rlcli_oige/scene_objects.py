@@ -43,20 +43,20 @@ class XFormPrim(Counterpart):
             stage.note_ignored(f"scale of {self.prim_path}", "give a model of the right size", lost=True)
 
     def set_collision_enabled(self, enabled: bool) -> None:
-        """Turn collisions on or off."""
+        """Turn the collisions of the object on or off."""
         self.prim.settings["collisions"] = bool(enabled)
 
     def apply_visual_material(self, *args: Any, **kwargs: Any) -> None:
         """Do nothing: the model has the colours."""
 
     def set_world_pose(self, position: Any = None, orientation: Any = None) -> None:
-        """Place the object in its environment."""
+        """Set position (3,) [m] and orientation (4,) (w, x, y, z), relative to the environment; None: unchanged."""
         self.prim.stage.define(self.prim_path, position, orientation)
 
     set_local_pose = set_world_pose
 
     def get_world_pose(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return position [m] and orientation in the environment."""
+        """Return position (3,) [m] and orientation (4,) (w, x, y, z), relative to the environment."""
         return np.array(self.prim.owner.pos), np.array(self.prim.owner.quat)
 
     get_local_pose = get_world_pose

@@ -77,7 +77,7 @@ class Prim(Counterpart):
         return isinstance(self.element, mujoco.MjsJoint)
 
     def GetPath(self) -> str:  # noqa: N802  (USD's names)
-        """Return the path."""
+        """Return the path of the prim."""
         return self.prim_path
 
     GetPrimPath = GetPath
@@ -87,15 +87,15 @@ class Prim(Counterpart):
         return self
 
     def GetName(self) -> str:  # noqa: N802
-        """Return the last part of the path."""
+        """Return the last part of the prim's path."""
         return self.prim_path.rpartition("/")[2]
 
     def GetStage(self) -> Stage:  # noqa: N802
-        """Return the stage."""
+        """Return the stage that the prim belongs to."""
         return self.stage
 
     def GetTypeName(self) -> str:  # noqa: N802
-        """Return the type of the prim in USD."""
+        """Return the type of the prim in USD, such as `Camera`; `Xform` (a frame) for a prim without a type."""
         return self.kind or "Xform"
 
     def IsValid(self) -> bool:  # noqa: N802
@@ -187,7 +187,7 @@ class Stage(Counterpart):
         """Like `ignored`, for calls that change the motion in OmniIsaacGymEnvs."""
 
     def GetPrimAtPath(self, path: Any) -> Prim:  # noqa: N802
-        """Return the prim at a path. It is invalid if there is none."""
+        """Return the prim at a path. If there is none, return a prim whose `IsValid()` is False."""
         path = str(path).rstrip("/")
         if path in self.prims:
             return self.prims[path]
@@ -221,11 +221,11 @@ class Stage(Counterpart):
         return prim
 
     def RemovePrim(self, path: Any) -> None:  # noqa: N802
-        """Remove a prim."""
+        """Remove the prim at a path, if there is one."""
         self.prims.pop(str(path), None)
 
     def define(self, path: str, pos: Any, quat: Any) -> Prim:
-        """Add a prim, or place an existing one. A path inside of a referenced USD file places its whole model."""
+        """Add a prim, or set the pose of an existing one. For a path inside of a USD file, the whole model moves."""
         reference = next((ref for ref in self.references if path == ref or path.startswith(f"{ref}/")), None)
         if reference is not None and reference not in self.prims and reference != path:
             self.define(reference, None, None)
@@ -248,7 +248,7 @@ class Stage(Counterpart):
         return np.array(prim.owner.pos, dtype=float)
 
     def load(self, prim: Prim, kinds: list[str]) -> None:
-        """Load a model: the file that `--model` or the YAML names, or the built-in one of its class.
+        """Load the model of a prim: the file that `--model` or the YAML names, or the built-in one of its class.
 
         Raises:
             ConfigError: if there is no model, or it cannot be read.
@@ -315,7 +315,7 @@ class Stage(Counterpart):
             _add_joint(scene, joint)
 
     def note_ignored(self, what: str, reason: str, lost: bool = False) -> None:
-        """Record a call without effect in MuJoCo, to log it later; `lost`: its effect would change the motion."""
+        """Record a call without effect in MuJoCo, to log it later. `lost`: in PhysX the call changes the motion."""
         (self.lost if lost else self.ignored).setdefault(what, f"{user_location()}{reason}")
 
     def _rename_elements(self, prim: Prim, where: str) -> None:
@@ -399,7 +399,7 @@ def get_current_stage(fabric: bool = False) -> Stage:
 
 
 def note_ignored(what: str, reason: str, lost: bool = False) -> None:
-    """Record a call of the task without effect in MuJoCo, like `Stage.note_ignored`, if a task is being built."""
+    """Call `Stage.note_ignored` of the task that is being built; do nothing if no task is being built."""
     if _CURRENT_STAGES:
         _CURRENT_STAGES[-1].note_ignored(what, reason, lost)
 

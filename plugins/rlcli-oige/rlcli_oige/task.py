@@ -79,7 +79,7 @@ class SimConfig(Counterpart):
         return {**ACTOR_DEFAULTS, **{key: value for key, value in settings.items() if key in ACTOR_DEFAULTS}}
 
     def apply_articulation_settings(self, name: str, prim: Prim, cfg: Mapping[str, Any]) -> None:
-        """Store an actor's settings at its prim; they are applied to its model when the scene is complete."""
+        """Store an actor's settings at its prim. The model takes the settings when the scene is complete."""
         for key, value in cfg.items():
             if value is not None and not (isinstance(value, int | float) and value == -1):
                 prim.settings[key] = value
@@ -87,15 +87,15 @@ class SimConfig(Counterpart):
     def apply_rigid_body_settings(
         self, name: str, prim: Prim, cfg: Mapping[str, Any], is_articulation: bool = False
     ) -> None:
-        """Record an actor's settings, like `apply_articulation_settings`."""
+        """Store an actor's settings at its prim, as `apply_articulation_settings` does."""
         self.apply_articulation_settings(name, prim, cfg)
 
     def apply_rigid_shape_settings(self, name: str, prim: Prim, cfg: Mapping[str, Any]) -> None:
-        """Record an actor's settings, like `apply_articulation_settings`."""
+        """Store an actor's settings at its prim, as `apply_articulation_settings` does."""
         self.apply_articulation_settings(name, prim, cfg)
 
     def make_kinematic(self, name: str, prim: Prim, cfg: Any = None, value: Any = None) -> None:
-        """Make a body kinematic: it moves only when its pose is set."""
+        """Make a body kinematic: a kinematic body moves only when the task sets its pose."""
         prim.settings["make_kinematic"] = self._value(name, "make_kinematic", value)
 
     def set_density(self, name: str, prim: Prim, value: float | None = None) -> None:
@@ -210,7 +210,7 @@ class World(SimulationContext):
 
     @property
     def stage(self) -> Stage:
-        """The stage."""
+        """The stage, with the prims of the scene."""
         return self._env.stage
 
     def play(self) -> None:
@@ -259,7 +259,7 @@ class EnvHandle(Counterpart):
 
     @property
     def task(self) -> RLTask:
-        """The task."""
+        """The task that runs in the environment."""
         return self.runner.task
 
     _task = task
@@ -281,9 +281,9 @@ class RLTask(DirectTask):
     A subclass sets `_num_observations`, `_num_actions` and, for privileged observations of the critic, `_num_states`
     before it calls this constructor.
 
-    OmniIsaacGymEnvs has one flag, `reset_buf`, for termination and time-out. The environment splits it. Where
-    `progress_buf >= _max_episode_length - 1`, it calls `is_done` a second time with `progress_buf` at 1. If the flag is
-    then no longer set, the episode was truncated; otherwise it was terminated.
+    OmniIsaacGymEnvs has one flag, `reset_buf`, for termination and time-out. rlcli's environment has two. Where
+    `progress_buf >= _max_episode_length - 1`, the environment calls `is_done` again with `progress_buf` at 1. If
+    `reset_buf` is then 0, the episode was truncated (time-out); otherwise the episode was terminated.
     """
 
     _num_observations: int
@@ -378,17 +378,17 @@ class RLTask(DirectTask):
 
     @property
     def world(self) -> World:
-        """The simulation."""
+        """The simulation, with the methods of Isaac Sim's World."""
         return self._env.world
 
     @property
     def scene(self) -> SceneRegistry:
-        """The registry of views."""
+        """The registry of the task's views and objects by name."""
         return self._env.world.scene
 
     @property
     def cfg(self) -> dict[str, Any]:  # type: ignore[override]
-        """All settings."""
+        """All settings; those of the task are under `task`."""
         return self._cfg
 
     def set_up_scene(
@@ -399,7 +399,7 @@ class RLTask(DirectTask):
         filter_collisions: bool = True,
         copy_from_source: bool = False,
     ) -> None:
-        """Place the environments on the grid. A task's own method calls this after it created its robots."""
+        """Place the environments on the grid. A subclass's `set_up_scene` calls this after it created its robots."""
         runner = self._env.runner
         self._env_pos = runner.place_environments(getattr(self, "_env_spacing", runner.config.scene.env_spacing))
 
@@ -415,7 +415,7 @@ class RLTask(DirectTask):
         self.is_extension = is_extension
 
     def get_states(self) -> Any:
-        """Fill states_buf, if the task has privileged observations of the critic."""
+        """Fill and return states_buf, for a task with privileged observations of the critic; here only return it."""
         return self.states_buf
 
     def get_extras(self) -> Any:

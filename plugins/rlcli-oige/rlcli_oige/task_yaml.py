@@ -69,9 +69,9 @@ def translate(
     Args:
         document: the task YAML.
         label: name of the file in messages.
-        class_file: source file of the task's class; if the YAML has no episode length, it is read from this file.
-        class_name: name of the class.
-        agent_file: the agent's YAML.
+        class_file: source file of the task's class; if the YAML has no episode length, the length is read here.
+        class_name: name of the task's class.
+        agent_file: the rl_games YAML of the agent.
 
     Raises:
         ConfigError: with every unknown key, and every interpolation that cannot be evaluated.

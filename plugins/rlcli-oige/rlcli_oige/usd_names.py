@@ -130,7 +130,7 @@ class Transform:
         return Vector(self._pos)
 
     def ExtractRotationQuat(self) -> Quaternion:  # noqa: N802
-        """Return the orientation."""
+        """Return the orientation as a `Quaternion`."""
         return Quaternion(self._quat[0], self._quat[1:])
 
 

@@ -117,7 +117,7 @@ class Schema(metaclass=_SchemaClass):
 
     @classmethod
     def Define(cls, stage: Stage, path: Any) -> Schema:  # noqa: N802
-        """Add a prim of this type."""
+        """Add a prim whose type in USD is the name of this schema, and return the schema applied to the prim."""
         prim = stage.DefinePrim(path, cls.__name__)
         where = Attribute(prim, cls.__name__, "", "where")
         where.value = user_location()
@@ -141,12 +141,12 @@ class Schema(metaclass=_SchemaClass):
         return name in ("PhysxRigidBodyAPI", "RigidBodyAPI", "MassAPI", "CollisionAPI") and prim.is_body()
 
     def GetPrim(self) -> Prim:  # noqa: N802
-        """Return the prim."""
+        """Return the prim that the schema is applied to."""
         prim: Prim = self._prim
         return prim
 
     def GetPath(self) -> str:  # noqa: N802
-        """Return the path of the prim."""
+        """Return the path of the prim that the schema is applied to."""
         return self.GetPrim().prim_path
 
     def __bool__(self) -> bool:

@@ -11,7 +11,7 @@ from rlcli.registry.framework_imports import TaskFileLoader
 
 
 def user_file() -> tuple[Path, int] | None:
-    """Return the file and line of the innermost running code of a task; None outside of it."""
+    """Return the file and line of the innermost code of a task on the call stack; None if no such code runs."""
     frame = sys._getframe(1)
     while frame is not None:
         if isinstance(frame.f_globals.get("__loader__"), TaskFileLoader):
@@ -21,7 +21,7 @@ def user_file() -> tuple[Path, int] | None:
 
 
 def user_location() -> str:
-    """Return `FILE:LINE: ` of the code of the task that is running; empty outside of it."""
+    """Return `FILE:LINE: ` of the innermost code of a task on the call stack; empty if no such code runs."""
     found = user_file()
     return "" if found is None else f"{found[0]}:{found[1]}: "
 
@@ -37,7 +37,7 @@ def error_location(error: BaseException) -> str:
 
 
 class MissingAttributeError(TaskError, AttributeError):
-    """Error of a task that uses an attribute of Isaac Sim's class that rlcli's class does not have."""
+    """Error of a task that uses an attribute of a class of Isaac Sim which rlcli's replacement class lacks."""
 
 
 class Counterpart:

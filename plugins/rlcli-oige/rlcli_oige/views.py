@@ -43,7 +43,7 @@ class XFormPrimView(Counterpart):
         self._env: OigeEnv | None = None
 
     def bind(self, env: OigeEnv) -> None:
-        """Connect the view to the running simulation. The environment calls this.
+        """Connect the view to the running simulation. The environment calls this method.
 
         Raises:
             TaskError: if the path matches nothing.
@@ -118,12 +118,12 @@ class XFormPrimView(Counterpart):
         return self._env
 
     def get_world_poses(self, indices: Any = None, clone: bool = True, usd: bool = True) -> tuple[Tensor, Tensor]:
-        """Return positions [m] with the environment's grid position, and orientations. (n, 3), (n, 4)"""
+        """Return positions [m] with the environment's grid position, and orientations (w, x, y, z). (n, 3), (n, 4)"""
         position, quat = self.get_local_poses(indices)
         return position + select_rows(self._origins, self._index(indices)), quat
 
     def get_local_poses(self, indices: Any = None) -> tuple[Tensor, Tensor]:
-        """Return positions [m] relative to the environment, and orientations. (n, 3), (n, 4)"""
+        """Return positions [m] relative to the environment, and orientations (w, x, y, z). (n, 3), (n, 4)"""
         sim = self.env.sim
         positions, quats = [], []
         for entity, body, root, mocap in zip(self._entities, self._bodies, self._roots, self._mocap, strict=True):
@@ -142,10 +142,10 @@ class XFormPrimView(Counterpart):
     def set_world_poses(
         self, positions: Any = None, orientations: Any = None, indices: Any = None, usd: bool = True
     ) -> None:
-        """Set positions with the environment's grid position, and orientations. (n, 3) [m], (n, 4); None: keep
+        """Set positions with the environment's grid position, and orientations. (n, 3) [m], (n, 4); None: unchanged
 
-        Only roots of floating robots, free bodies and kinematic bodies move. For other bodies this does nothing, as for
-        links in OmniIsaacGymEnvs.
+        Only roots of floating robots, free bodies and kinematic bodies move. For other bodies this method does nothing,
+        as in OmniIsaacGymEnvs.
         """
         index = self._index(indices)
         if positions is not None:
@@ -153,7 +153,7 @@ class XFormPrimView(Counterpart):
         self.set_local_poses(positions, orientations, indices)
 
     def set_local_poses(self, translations: Any = None, orientations: Any = None, indices: Any = None) -> None:
-        """Set positions relative to the environment, and orientations. (n, 3) [m], (n, 4); None: keep"""
+        """Set positions relative to the environment, and orientations. (n, 3) [m], (n, 4); None: unchanged"""
         for which, (entity, root, mocap) in enumerate(zip(self._entities, self._roots, self._mocap, strict=True)):
             rows, selected = self._rows_of(which, indices)
             for values, size, start in ((translations, 3, 0), (orientations, 4, 3)):
@@ -204,12 +204,12 @@ class XFormPrimView(Counterpart):
             self._write("qvel", rows, slice(entity.root_dof, entity.root_dof + 6), local)
 
     def set_linear_velocities(self, velocities: Any, indices: Any = None) -> None:
-        """Set linear velocities, world frame. (n, 3) [m/s]"""
+        """Set linear velocities, world frame, and keep the angular ones. (n, 3) [m/s]"""
         kept = self.get_velocities(indices)[:, 3:]
         self.set_velocities(torch.cat([self._tensor(velocities), kept], dim=1), indices)
 
     def set_angular_velocities(self, velocities: Any, indices: Any = None) -> None:
-        """Set angular velocities, world frame. (n, 3) [rad/s]"""
+        """Set angular velocities, world frame, and keep the linear ones. (n, 3) [rad/s]"""
         kept = self.get_velocities(indices)[:, :3]
         self.set_velocities(torch.cat([kept, self._tensor(velocities)], dim=1), indices)
 
@@ -289,7 +289,13 @@ class RigidPrimView(XFormPrimView):
             self.set_masses(self._initial_masses)
 
     def apply_forces(self, forces: Any, indices: Any = None, is_global: bool = True) -> None:
-        """Apply forces at the centres of mass until the end of this step. (n, 3) [N], world or body frame"""
+        """Apply forces at the centres of mass until the end of this step, as `apply_forces_and_torques_at_pos` does.
+
+        Args:
+            forces: (n, 3) [N].
+            indices: rows of the view; None: all.
+            is_global: whether `forces` are in the world frame; otherwise they are in the frame of each body.
+        """
         self.apply_forces_and_torques_at_pos(forces, None, None, indices, is_global)
 
     def apply_forces_and_torques_at_pos(
@@ -323,7 +329,7 @@ class RigidPrimView(XFormPrimView):
         return select_rows(self._model_field("body_mass").reshape(-1), self._index(indices))
 
     def set_masses(self, masses: Any, indices: Any = None) -> None:
-        """Set masses; inertias are scaled in proportion. (n,) [kg]"""
+        """Set masses. (n,) [kg] The inertia of a body is scaled by the same factor as its mass."""
         masses = self._tensor(masses).reshape(-1)
         mass, inertia = self.env.engine.expand("body_mass"), self.env.engine.expand("body_inertia")
         for which, body in enumerate(self._bodies):
@@ -339,7 +345,10 @@ class RigidPrimView(XFormPrimView):
         return select_rows(torch.diag_embed(diagonal).reshape(-1, 9), self._index(indices))
 
     def get_net_contact_forces(self, indices: Any = None, clone: bool = True, dt: float = 1.0) -> Tensor:
-        """Return the sum of the contact forces on each body in the last substep, world frame. (n, 3) [N]"""
+        """Return the sum of the contact forces on each body in the last physics step, world frame. (n, 3) [N]
+
+        `dt` has no effect.
+        """
         forces = torch.stack([self.env.contact_force(body) for body in self._bodies], dim=1).reshape(-1, 3)
         return select_rows(forces, self._index(indices))
 

@@ -24,10 +24,12 @@ class YamlTranslator:
     sources: dict[Path, Path] = field(default_factory=dict)
     """Key of a translated setting -> key of the file."""
     notes: list[Note] = field(default_factory=list)
+    """How each key of the file was translated, from `note`."""
     problems: list[Problem] = field(default_factory=list)
+    """Mistakes in the file, from `problem`."""
 
     def put(self, target: Path, value: Any, source: Path) -> None:
-        """Set a translated setting and record its source."""
+        """Set the translated setting `target` to a value, and record the key `source` of the file it comes from."""
         node = self.data
         for step in target[:-1]:
             node = node.setdefault(str(step), {})

@@ -109,7 +109,11 @@ class RlGamesTrainer(BaseTrainer):
         self.keep_recent_obs(obs["policy"])
 
     def iterate(self) -> Report:
-        """Collect a rollout, then update."""
+        """Collect a rollout, update the networks, and return the values that the trainer logs.
+
+        Raises:
+            DivergedError: if a loss or a weight is not finite.
+        """
         before, begin = dict(self.env.seconds), time.perf_counter()
         update, losses = self._epoch()
         total = time.perf_counter() - begin

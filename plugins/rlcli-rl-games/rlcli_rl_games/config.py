@@ -191,7 +191,7 @@ class PpoSettings(_Settings):
     reward_shaper: RewardShaper = RewardShaper()
     """Scale, shift and limits of the reward."""
     mixed_precision: Literal[False] = False
-    """Updates use float32."""
+    """Whether updates use mixed precision; only False is allowed."""
     gamma: Fraction
     """Discount factor."""
     tau: Fraction
@@ -255,7 +255,7 @@ class SacSettings(_Settings):
     reward_shaper: RewardShaper = RewardShaper()
     """Scale, shift and limits of the reward."""
     mixed_precision: Literal[False] = False
-    """Updates use float32."""
+    """Whether updates use mixed precision; only False is allowed."""
     gamma: Fraction = 0.99
     """Discount factor."""
     num_steps_per_episode: Count = 1

@@ -45,7 +45,7 @@ class PpoTrainer(RlGamesTrainer):
     def _bootstrapping(self, agent: Any, shaper: Any) -> Any:
         """Return a reward shaper that calls rl_games' shaper and bootstraps time-outs.
 
-        At a time-out it adds gamma times the critic's value of the episode's last observation.
+        At a time-out the new shaper adds gamma times the critic's value of the episode's last observation.
         """
 
         def shape(reward: Tensor) -> Tensor:

@@ -23,7 +23,7 @@ class RlGamesVecEnv(IVecEnv):
         statistics: statistics of the episodes that end.
         central: whether the observation group `critic` is passed as `states`.
         time_outs: whether time-outs are passed to rl_games, which then bootstraps in its own way.
-        threads: threads of torch outside of the environment's step, which runs on one.
+        threads: threads of torch outside of the environment's step; the step itself runs on one thread.
     """
 
     def __init__(

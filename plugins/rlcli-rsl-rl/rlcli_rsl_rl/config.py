@@ -236,9 +236,9 @@ class RunnerConfig(AgentConfig):
     logger: str = "tensorboard"
     """Ignored: use --logger."""
     neptune_project: str = "isaaclab"
-    """Ignored."""
+    """Ignored: rlcli has no logger for Neptune."""
     wandb_project: str = "isaaclab"
-    """Ignored."""
+    """Ignored: the environment variable WANDB_PROJECT sets the project."""
     resume: bool = False
     """Ignored: use --resume."""
     load_run: str = ".*"

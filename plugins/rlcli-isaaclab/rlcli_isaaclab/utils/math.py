@@ -31,26 +31,26 @@ def wrap_to_pi(angles: Tensor) -> Tensor:
 
 
 def quat_apply(quat: Tensor, vec: Tensor) -> Tensor:
-    """Rotate a vector. (..., 4), (..., 3) -> (..., 3)"""
+    """Return `vec` rotated by `quat`. (..., 4), (..., 3) -> (..., 3)"""
     axis = quat[..., 1:]
     twice = 2.0 * torch.linalg.cross(axis, vec, dim=-1)
     return vec + quat[..., :1] * twice + torch.linalg.cross(axis, twice, dim=-1)
 
 
 def quat_apply_inverse(quat: Tensor, vec: Tensor) -> Tensor:
-    """Rotate a vector by the inverse rotation. (..., 4), (..., 3) -> (..., 3)"""
+    """Return `vec` rotated by the inverse of `quat`. (..., 4), (..., 3) -> (..., 3)"""
     axis = quat[..., 1:]
     twice = 2.0 * torch.linalg.cross(axis, vec, dim=-1)
     return vec - quat[..., :1] * twice + torch.linalg.cross(axis, twice, dim=-1)
 
 
 def quat_rotate(q: Tensor, v: Tensor) -> Tensor:
-    """Rotate a vector, as `quat_apply` does. (..., 4), (..., 3) -> (..., 3)"""
+    """Return `v` rotated by `q`, as `quat_apply` does. (..., 4), (..., 3) -> (..., 3)"""
     return quat_apply(q, v)
 
 
 def quat_rotate_inverse(q: Tensor, v: Tensor) -> Tensor:
-    """Rotate a vector, as `quat_apply_inverse` does. (..., 4), (..., 3) -> (..., 3)"""
+    """Return `v` rotated by the inverse of `q`, as `quat_apply_inverse` does. (..., 4), (..., 3) -> (..., 3)"""
     return quat_apply_inverse(q, v)
 
 
@@ -73,7 +73,7 @@ def yaw_quat(quat: Tensor) -> Tensor:
 
 
 def quat_apply_yaw(quat: Tensor, vec: Tensor) -> Tensor:
-    """Rotate a vector by the yaw of a rotation. (..., 4), (..., 3) -> (..., 3)"""
+    """Return `vec` rotated by the yaw of `quat` alone. (..., 4), (..., 3) -> (..., 3)"""
     return quat_apply(yaw_quat(quat), vec)
 
 
@@ -122,22 +122,22 @@ def combine_frame_transforms(
 
 
 def normalize(x: Tensor, eps: float = 1e-9) -> Tensor:
-    """Scale vectors to length 1. (..., n)"""
+    """Return vectors scaled to length 1; a vector of length 0 stays 0. (..., n)"""
     return x / x.norm(p=2, dim=-1, keepdim=True).clamp(min=eps)
 
 
 def scale_transform(x: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
-    """Map values linearly from [lower, upper] to [-1, 1]."""
+    """Return x mapped linearly from [lower, upper] to [-1, 1], in the shape of x."""
     return 2.0 * (x - 0.5 * (lower + upper)) / (upper - lower)
 
 
 def unscale_transform(x: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
-    """Map values linearly from [-1, 1] to [lower, upper]."""
+    """Return x mapped linearly from [-1, 1] to [lower, upper], in the shape of x."""
     return 0.5 * (x * (upper - lower) + upper + lower)
 
 
 def saturate(x: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
-    """Clamp values to [lower, upper]."""
+    """Return x clamped to [lower, upper], in the shape of x."""
     return torch.maximum(torch.minimum(x, upper), lower)
 
 
@@ -194,7 +194,7 @@ def quat_from_matrix(matrix: Tensor) -> Tensor:
 
 
 def convert_quat(quat: Any, to: str = "xyzw") -> Any:
-    """Move the real part of quaternions to the end (`xyzw`) or to the start (`wxyz`). (..., 4)"""
+    """Return quaternions with the real part moved to the end (`xyzw`) or to the start (`wxyz`). (..., 4)"""
     order = [1, 2, 3, 0] if to == "xyzw" else [3, 0, 1, 2]
     return quat[..., order]
 
@@ -221,13 +221,17 @@ def compute_pose_error(
 
 
 def apply_delta_pose(source_pos: Tensor, source_rot: Tensor, delta_pose: Tensor, eps: float = 1.0e-6) -> Any:
-    """Return a pose that is moved by `delta_pose`: a translation [m] and a rotation vector [rad]. (n, 6)"""
+    """Return (position (n, 3), quaternion (n, 4)) of a pose moved by `delta_pose` (n, 6).
+
+    `delta_pose` is a translation [m] and a rotation, its axis times its angle [rad], both in the frame of the pose's
+    coordinates.
+    """
     turn = quat_from_angle_axis(delta_pose[:, 3:6].norm(p=2, dim=-1), delta_pose[:, 3:6])
     return source_pos + delta_pose[:, :3], multiply(turn, source_rot)
 
 
 def transform_points(points: Tensor, pos: Tensor | None = None, quat: Tensor | None = None) -> Tensor:
-    """Rotate points, then translate them.
+    """Return points rotated and then translated, in the shape of `points`, or (n, p, 3) for several transformations.
 
     Args:
         points: (n, p, 3), or (p, 3) for one set of points.
@@ -262,7 +266,7 @@ def random_yaw_orientation(num: int, device: str) -> Tensor:
 
 
 def sample_triangle(lower: float, upper: float, size: Any, device: Any) -> Tensor:
-    """Sample from [lower, upper] with a density that is 0 in the middle and grows linearly to both ends.
+    """Return samples of the shape `size` from [lower, upper]; their density grows linearly from 0 in the middle.
 
     Despite the name, this is what Isaac Lab's function does.
     """
@@ -289,19 +293,19 @@ def orthogonalize_perspective_depth(depth: Tensor, intrinsics: Tensor) -> Tensor
 
 
 def sample_uniform(lower: Any, upper: Any, size: Any, device: Any) -> Tensor:
-    """Sample uniformly from [lower, upper)."""
+    """Return uniform samples from [lower, upper), of the shape `size`."""
     shape = (size,) if isinstance(size, int) else tuple(size)
     return torch.rand(*shape, device=device) * (upper - lower) + lower
 
 
 def sample_gaussian(mean: Any, std: Any, size: Any, device: Any) -> Tensor:
-    """Sample from a normal distribution."""
+    """Return samples from a normal distribution, of the shape `size`."""
     shape = (size,) if isinstance(size, int) else tuple(size)
     return torch.randn(*shape, device=device) * std + mean
 
 
 def sample_log_uniform(lower: Any, upper: Any, size: Any, device: Any) -> Tensor:
-    """Sample log-uniformly from [lower, upper)."""
+    """Return log-uniform samples from [lower, upper), of the shape `size`."""
     low, high = (torch.as_tensor(end, device=device, dtype=torch.float32).log() for end in (lower, upper))
     return sample_uniform(low, high, size, device).exp()
 

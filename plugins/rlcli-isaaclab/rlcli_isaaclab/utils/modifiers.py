@@ -53,12 +53,12 @@ class DigitalFilter(ModifierBase):
         self.y_n = torch.zeros(*data_dim, len(self.A), device=device)
 
     def reset(self, env_ids: Any = None) -> None:
-        """Set past inputs and outputs to 0."""
+        """Set past inputs and outputs of the environments `env_ids` to 0; None: of all environments."""
         for past in (self.x_n, self.y_n):
             past[slice(None) if env_ids is None else env_ids] = 0.0
 
     def __call__(self, data: Tensor) -> Tensor:
-        """Return the filter's output."""
+        """Return the output of the filter for the observation `data`. (num_envs, ...) each"""
         self.x_n = torch.cat([data.unsqueeze(-1), self.x_n[..., :-1]], dim=-1)
         output = self.x_n @ self.B - self.y_n @ self.A
         self.y_n = torch.cat([output.unsqueeze(-1), self.y_n[..., :-1]], dim=-1)
@@ -73,12 +73,12 @@ class Integrator(ModifierBase):
         self.integral, self.y_prev = (torch.zeros(data_dim, device=device) for _ in range(2))
 
     def reset(self, env_ids: Any = None) -> None:
-        """Set the integral and the last input to 0."""
+        """Set the integral and the last input of the environments `env_ids` to 0; None: of all environments."""
         for state in (self.integral, self.y_prev):
             state[slice(None) if env_ids is None else env_ids] = 0.0
 
     def __call__(self, data: Tensor) -> Tensor:
-        """Return the integral."""
+        """Add the observation `data` to the integral, and return the integral. (num_envs, ...) each"""
         self.integral = self.integral + 0.5 * (data + self.y_prev) * self._cfg.dt
         self.y_prev = data.clone()
         return self.integral

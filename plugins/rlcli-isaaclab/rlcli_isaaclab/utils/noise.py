@@ -73,7 +73,7 @@ class NoiseModel:
         self._noise_model_cfg, self._num_envs, self._device = noise_model_cfg, num_envs, device
 
     def reset(self, env_ids: Any = None) -> None:
-        """Start new episodes in environments; None: in all."""
+        """Do nothing: this noise has no state. A subclass resets its state in the environments `env_ids`; None: all."""
 
     def __call__(self, data: Tensor) -> Tensor:
         """Return the observation with noise. (num_envs, ...)"""
@@ -90,7 +90,7 @@ class NoiseModelWithAdditiveBias(NoiseModel):
         self._sample_bias_per_component = noise_model_cfg.sample_bias_per_component
 
     def reset(self, env_ids: Any = None) -> None:
-        """Sample the biases of new episodes."""
+        """Sample new biases in the environments `env_ids`; None: in all environments."""
         rows = slice(None) if env_ids is None else env_ids
         self._bias[rows] = self._bias_noise_cfg.func(self._bias[rows], self._bias_noise_cfg)
 

@@ -58,7 +58,7 @@ def pose_in_A_to_pose_in_B(pose_in_A: Tensor, pose_A_in_B: Tensor) -> Tensor:  #
 
 
 def is_identity_pose(pos: Tensor, rot: Tensor) -> bool:
-    """Return whether positions are 0 and quaternions (w, x, y, z) are the identity."""
+    """Return whether all positions (..., 3) are 0 and all quaternions (w, x, y, z) (..., 4) are the identity."""
     one = torch.zeros_like(rot)
     one[..., 0] = 1.0
     return torch.allclose(pos, torch.zeros_like(pos)) and torch.allclose(rot, one)
@@ -77,7 +77,10 @@ def quat_slerp(q1: Tensor, q2: Tensor, tau: float) -> Tensor:
 
 
 def rigid_body_twist_transform(v0: Tensor, w0: Tensor, t01: Tensor, q01: Tensor) -> tuple[Tensor, Tensor]:
-    """Convert linear and angular velocities from a frame 0 to a frame 1, whose pose in frame 0 is t01, q01."""
+    """Return the linear and angular velocity (n, 3) of a body in a frame 1 from those in a frame 0 (v0, w0).
+
+    The pose of frame 1 in frame 0 is the position t01 (n, 3) and the quaternion q01 (n, 4).
+    """
     return rotate_inverse(q01, v0 + cross(w0, t01)), rotate_inverse(q01, w0)
 
 

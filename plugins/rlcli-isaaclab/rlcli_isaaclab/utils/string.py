@@ -29,6 +29,9 @@ def resolve_matching_names(
     """Return (indices, names) of the strings in `list_of_strings` that match `keys`, names or regexes.
 
     The order is that of `list_of_strings`, or with `preserve_order` that of `keys`.
+
+    Raises:
+        NameProblem: if a key matches no string.
     """
     names = list(list_of_strings)
     found = match([keys] if isinstance(keys, str) else list(keys), names, "name")
