@@ -191,7 +191,7 @@ class DirectEnv(VecEnv):
             raise TaskError(message) from error
         if not (isinstance(task_class, type) and issubclass(task_class, DirectTask)):
             raise TaskError(
-                f"task '{source.name}' is broken: {source.task} is not derived from DirectTask; derive the class"
+                f"task '{source.name}' is broken: {source.task} is not a DirectTask; derive the class from DirectTask"
             )
         return task_class
 
