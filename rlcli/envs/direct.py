@@ -190,8 +190,9 @@ class DirectEnv(VecEnv):
             message = f"task '{source.name}' is broken: {source.task}: {short_error(error)}"
             raise TaskError(message) from error
         if not (isinstance(task_class, type) and issubclass(task_class, DirectTask)):
-            message = f"task '{source.name}' is broken: {source.task} is no subclass of DirectTask"
-            raise TaskError(f"{message}; derive the class from DirectTask")
+            raise TaskError(
+                f"task '{source.name}' is broken: {source.task} is not a DirectTask; derive the class from DirectTask"
+            )
         return task_class
 
     def _import_task(self, reference: str) -> Any:

@@ -62,7 +62,7 @@ def command(
         rlcli stress latest --sweep body_mass=0.5:2
             Evaluate the newest run with half to twice the mass, in five steps.
         rlcli stress cartpole --sweep action_delay=0:3 --against lqr -o map.png
-            Compare the newest run of cartpole with an LQR controller under delays, and write the heat map.
+            Compare the newest run with an LQR under delays; write the heat map.
     """
     from rlcli.evaluation.limits import read_limits, require_success
     from rlcli.evaluation.session import PolicyRequest, baseline, find_policy, split_overrides
