@@ -32,16 +32,18 @@ def default_pose(spec: mujoco.MjSpec) -> np.ndarray | None:
     return None if start is None else np.array(start.data)
 
 
-def remove_scene_elements(spec: mujoco.MjSpec) -> None:
+def remove_scene_elements(spec: mujoco.MjSpec) -> list[str]:
     """Remove ground, lights and keyframes, which the task defines itself; name all bodies, joints and actuators.
 
     Welds and connections to mocap bodies are removed, too: a task does not move mocap bodies, so they would hold the
-    robot. If all actuators pull at tendons, they are removed, and the task drives the joints directly.
+    robot. If as many joints are pulled by tendons as have an actuator of their own, the actuators of tendons are
+    removed, and the task drives these joints directly.
+
+    Returns:
+        Names of the joints whose tendons have lost their actuators. It is empty if the robot has no other actuator:
+        then the task drives all joints.
     """
-    if all(actuator.trntype == mujoco.mjtTrn.mjTRN_TENDON for actuator in spec.actuators):
-        measured = [sensor for sensor in spec.sensors if sensor.objtype == mujoco.mjtObj.mjOBJ_ACTUATOR]
-        for element in (*measured, *list(spec.actuators)):
-            spec.delete(element)
+    pulled = _replace_tendon_actuators(spec)
     for key in list(spec.keys):
         spec.delete(key)
     mocap = {body.name for body in spec.bodies if body.mocap}
@@ -61,6 +63,25 @@ def remove_scene_elements(spec: mujoco.MjSpec) -> None:
             if not element.name:
                 element.name = next(n for i in range(number, 10**6) if (n := f"{kind}{i}") not in taken)
                 taken.add(element.name)
+    return [joint.name for joint in pulled] if len(spec.actuators) else []
+
+
+def _replace_tendon_actuators(spec: mujoco.MjSpec) -> list[mujoco.MjsJoint]:
+    """Remove the actuators of tendons if these pull at many joints; return the joints."""
+    own = {a.target for a in spec.actuators if a.trntype == mujoco.mjtTrn.mjTRN_JOINT}
+    tendons = [a for a in spec.actuators if a.trntype == mujoco.mjtTrn.mjTRN_TENDON]
+    wraps = [wrap for actuator in tendons for wrap in spec.tendon(actuator.target).path]
+    found = {wrap.target.name: wrap.target for wrap in wraps if wrap.type == mujoco.mjtWrap.mjWRAP_JOINT}
+    pulled = [joint for name, joint in found.items() if name not in own]
+    if len(pulled) < len(own):
+        return []
+    removed = {actuator.name for actuator in tendons}
+    for sensor in list(spec.sensors):
+        if sensor.objtype == mujoco.mjtObj.mjOBJ_ACTUATOR and sensor.objname in removed:
+            spec.delete(sensor)
+    for actuator in tendons:
+        spec.delete(actuator)
+    return pulled
 
 
 def put_robot_first(tree: ElementTree.Element, model: mujoco.MjModel) -> None:

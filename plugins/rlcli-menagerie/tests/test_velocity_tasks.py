@@ -68,6 +68,12 @@ def test_gains_and_limits_come_from_task_with_and_without_actuators(models, go1_
     assert armature == [0.00403, 0.00403, 0.00906] * 4
 
 
+def test_go1_trains_with_fewer_environments_on_cpu(models):
+    found = {device: resolve(find_task("go1-velocity"), device=device) for device in ("cpu", "cuda")}
+    assert {device: each.task.scene.num_envs for device, each in found.items()} == {"cpu": 512, "cuda": 4096}
+    assert found["cpu"].task.rewards == found["cuda"].task.rewards
+
+
 def test_go1_stands_on_feet(models):
     env = make("go1-velocity", 2, "events.push=null", "events.payload=null")
     for _ in range(60):
@@ -87,7 +93,7 @@ def test_g1_lying_down_terminates(models):
 
 @pytest.mark.parametrize("task", TASKS)
 def test_missing_model_error_says_what_to_install(task, tmp_path):
-    done = rlcli("eval", task, "--policy", "zero", "--json", PYTHONPATH=_without_mjlab())
+    done = rlcli("eval", task, "--policy", "zero", "--json", "--quiet", PYTHONPATH=_without_mjlab())
     assert done.returncode == 4, done.stderr
     error = json.loads(done.stdout)["error"]
     robot = task.partition("-")[0]

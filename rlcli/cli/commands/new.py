@@ -64,7 +64,8 @@ def command(
 def _print_design(design: "RobotTask") -> None:
     """Print the elements of the robot's MJCF, doubts about the file, and the kind of the task with the reason."""
     for what, names in design.found.items():
-        console.info(f"{len(names)} {what}: {listing([each or '(unnamed)' for each in names])}")
+        noun = what.removesuffix("s") if len(names) == 1 else what
+        console.info(f"{len(names)} {noun}: {listing([each or '(unnamed)' for each in names])}")
     for message, hint in design.doubts:
         console.warn(f"{message}; {hint}")
     if not design.has_pose:

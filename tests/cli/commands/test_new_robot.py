@@ -447,3 +447,18 @@ def test_joints_are_driven_if_all_actuators_pull_at_tendons(cli, tmp_path):
     motor = '<actuator><motor name="pull" tendon="t"/></actuator><sensor><actuatorfrc actuator="pull"/></sensor>'
     _, task = written(cli, tmp_path, begin + tendon + motor + "</mujoco>")
     assert task["actions"]["joint_position"]["joints"] == ["a", "b", "c"]
+
+
+def test_joints_of_tendons_are_driven_if_they_are_as_many_as_joints_with_an_actuator(cli, tmp_path):
+    begin = ARM.partition("<actuator>")[0]
+    sensor = '<sensor><actuatorfrc actuator="pull"/></sensor>'
+    for pulled, own, kind, driven in (("ab", "c", "reach", ["a", "b", "c"]), ("a", "bc", "balance", ["b", "c"])):
+        wrapped = "".join(f'<joint joint="{joint}" coef="1"/>' for joint in pulled)
+        motors = "".join(f'<motor joint="{joint}"/>' for joint in own) + '<motor name="pull" tendon="t"/>'
+        rest = f'<tendon><fixed name="t">{wrapped}</fixed></tendon><actuator>{motors}</actuator>{sensor}</mujoco>'
+        _, task = written(cli, tmp_path, begin + rest)
+        assert task["summary"].startswith({"reach": "Bring", "balance": "Keep"}[kind])
+        (action,) = task["actions"].values()
+        assert action["joints"] == driven
+        assert cli("validate", "--deep", "my-robot/my_robot").code == 0
+        shutil.rmtree(tmp_path / "my-robot")
