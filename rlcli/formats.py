@@ -135,6 +135,8 @@ class Note:
     status: Status
     text: str = ""
     """What the key was translated to, or which effect of the key is lost."""
+    agent: str = ""
+    """Name of the agent whose settings have the key; empty for a key of the task."""
 
     def __str__(self) -> str:
         """Return the note on one line."""

@@ -21,6 +21,11 @@ def place_of(value: object) -> str:
     kind = value if isinstance(value, type) else type(value)
     if not any(hasattr(kind, name) for name in _METHODS) or is_framework(kind.__module__):
         return ""
+    return class_place(kind)
+
+
+def class_place(kind: type) -> str:
+    """Return `file:line` of a class; empty if its source code is not known."""
     try:
         file, line = inspect.getsourcefile(kind), inspect.getsourcelines(kind)[1]
     except (OSError, TypeError):

@@ -47,7 +47,7 @@ class Resolved:
     vocabulary: Vocabulary
     """Signatures of the terms that the task may name."""
     notes: tuple[Note, ...] = ()
-    """How each key was translated, if the task is in another framework's format; else empty."""
+    """How each key of the task and of the chosen agent was translated, if another framework's format has them."""
     format: Format | None = None
     """The other framework's format in which the task is written; None: rlcli's own."""
 
@@ -149,9 +149,8 @@ def resolve(
         raise ConfigError(check.problems)
     if check.missing is not None:
         raise check.missing
-    return Resolved(
-        source, task, agent_config, name, trainer, check.layers, check.vocabulary, tuple(check.notes), check.format
-    )
+    notes = tuple(note for note in check.notes if note.agent in ("", name))
+    return Resolved(source, task, agent_config, name, trainer, check.layers, check.vocabulary, notes, check.format)
 
 
 def check_all(source: TaskSource, *, config_file: FilePath | None = None, overrides: Sequence[str] = ()) -> list[str]:

@@ -14,7 +14,7 @@ import copy
 import functools
 import logging
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from pathlib import Path as FilePath
 from typing import Any
@@ -31,7 +31,7 @@ from rlcli.registry import TaskSource, import_file, is_framework, load_module, l
 from rlcli.registry.failed_imports import FailedImport, error_location, report_failures, take_failures
 from rlcli.registry.formats import Format, first_result, format_of_module, require_module
 from rlcli.registry.module_names import with_own_names
-from rlcli.registry.task_imports import CONFIGURATION, ENVIRONMENT, registrations
+from rlcli.registry.task_imports import CONFIGURATION, ENVIRONMENT, files_that_register, registrations
 
 _log = logging.getLogger(__name__)
 _OWN = "rlcli.mdp."
@@ -296,10 +296,8 @@ def _registered(source: TaskSource) -> tuple[Any, dict[str, Any]]:
     wanted = str(source.python).removeprefix(str(source.root)).removeprefix(":")
     # a package need not import the packages inside of it that register tasks
     if wanted and wanted not in registrations:
-        for file in sorted(source.root.rglob("__init__.py")):
-            text = file.read_bytes()
-            if b"register(" in text and wanted.encode() in text:
-                import_file(file)
+        for file in files_that_register(source.root, wanted, "__init__.py"):
+            import_file(file)
     found = {
         name: kwargs
         for name, kwargs in registrations.items()
@@ -309,7 +307,8 @@ def _registered(source: TaskSource) -> tuple[Any, dict[str, Any]]:
         found[wanted] = registrations[wanted]
     if wanted and wanted not in found:
         known = did_you_mean(wanted, found) or f"registered tasks: {listing(found)}"
-        known = "; ".join(take_failures()) or known
+        scripts = files_that_register(source.root, wanted)
+        known = "; ".join(take_failures()) or listing(f"name the file: {file}:{wanted}" for file in scripts) or known
         raise TaskError(f"{source.root} does not register a task '{wanted}'", hint=known)
     if not wanted and len(found) != 1:
         hint = f"name one: {listing(f'{source.root}:{name}' for name in found)}" if found else None
@@ -394,8 +393,10 @@ def _add_agents(task: PythonTask, agents: Mapping[str, Any]) -> None:
     order = task.format.spec.agent_order if task.format is not None else ()
     found: dict[str, Any] = {}
     for name, agent in agents.items():
+        first = len(task.notes)
         try:
             data = _read_agent(task, name, agent)
+            task.notes[first:] = [replace(note, agent=name) for note in task.notes[first:]]
         except ConfigError as error:
             error = at_place(error, place_of(agent) or "configuration")
             if len(agents) == 1:

@@ -18,7 +18,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from pathlib import Path
-from types import ModuleType
+from types import FrameType, ModuleType
 from typing import Any
 
 from rlcli.registry.formats import Format, aliasing_formats
@@ -206,8 +206,16 @@ def _import(
         part = name or "".join(fromlist or ())
         if not own or not can_be_left_out(part, level, file):
             raise
-        failed = failed_import(f"{package}.{part}" if level else name, error)
+        failed = failed_import(f"{package}.{part}" if level else name, error, _running_line(file))
         return failed if name else _with_members(sys.modules[package], {part: failed})
+
+
+def _running_line(file: Path) -> str:
+    """Return `file:line` of the innermost line of a file that is running."""
+    frame: FrameType | None = sys._getframe(1)
+    while frame is not None and frame.f_code.co_filename != str(file):
+        frame = frame.f_back
+    return f"{file}:{frame.f_lineno}" if frame is not None else str(file)
 
 
 def _import_module(

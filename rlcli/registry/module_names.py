@@ -12,7 +12,11 @@ OWN_NAMES: dict[str, str] = {}
 
 
 def with_own_names(text: str) -> str:
-    """Return a text in which modules of tasks have the names that their files use, not those in `sys.modules`."""
+    """Return an error's text in which modules of tasks have the names that their files use, not those in `sys.modules`.
+
+    Python's ` (unknown location)` is left out: a module that a plugin replaces has no file.
+    """
+    text = text.replace(" (unknown location)", "")
     for module, own in OWN_NAMES.items():
         text = text.replace(module, own) if module.startswith(IMPORTED_NAME) else text
     return re.sub(rf"{IMPORTED_NAME}task_[0-9a-f]{{16}}_(\w+)", r"\1", text)

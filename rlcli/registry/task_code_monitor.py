@@ -45,10 +45,10 @@ def error_of_task(error: BaseException) -> TaskError | None:
     if not found or (isinstance(error, OSError | EOFError) and not raised_by_task(error)):
         return None
     frame, line = found[-1]
-    code = frame.f_code
+    code, hint = frame.f_code, getattr(error, "hint", None)
     return TaskError(
         f"{code.co_filename}:{line}: {code.co_name}: {short_error(error)}",
-        hint="correct the task's code at this line; --debug shows the traceback",
+        hint=hint if isinstance(hint, str) else "correct the task's code at this line; --debug shows the traceback",
     )
 
 

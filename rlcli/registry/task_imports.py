@@ -86,6 +86,18 @@ def import_file(file: Path) -> Any:
             return importlib.import_module(".".join((name, *inner)))
 
 
+def files_that_register(root: Path, task: str, name: str = "*.py") -> list[Path]:
+    """Return the Python files below a folder whose text registers tasks with Gymnasium and has the ID of a task.
+
+    Args:
+        root: the folder.
+        task: the ID of the task.
+        name: the name of the files, or a pattern.
+    """
+    texts = {file: file.read_bytes() for file in sorted(root.rglob(name)) if file.is_file()}
+    return [file for file, text in texts.items() if b"register(" in text and task.encode() in text]
+
+
 def import_from(package: Path, inner: str, *, run_start: bool = True) -> Any:
     """Import a module of a package by the package's folder.
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from rlcli_isaaclab.config_class import is_missing, to_dict
 from rlcli_isaaclab.scene_reader import SceneReader
-from rlcli_isaaclab.settings import Key, Node, Report, as_float
+from rlcli_isaaclab.settings import Key, Node, Report, as_float, kind_of
 from rlcli_isaaclab.term_reader import TermReader
 from rlcli_isaaclab.user_actuators import actuator_events
 
@@ -136,7 +136,7 @@ def agent(data: Mapping[str, Any], report: Report) -> dict[str, Any]:
         "algorithm": "ppo",
         "dialect": "rsl_rl",
         "max_iterations": top.require("max_iterations"),
-        "save_interval": top.require("save_interval"),
+        "save_interval": _save_interval(top),
         "num_steps": top.require("num_steps_per_env"),
         "action_bound": None if bound is None else as_float(bound),
         "actor": _network(policy, "actor_hidden_dims"),
@@ -148,7 +148,9 @@ def agent(data: Mapping[str, Any], report: Report) -> dict[str, Any]:
     if bool(policy.get("critic_obs_normalization", normalized)) != bool(normalized):
         policy.note("approximated", "critic_obs_normalization", "actor and critic share one observation normalizer")
     config["normalize_observations"] = bool(normalized)
-    if policy.get("class_name", "ActorCritic") == "ActorCriticRecurrent":
+    _require_class(top, "OnPolicyRunner")
+    _require_class(algorithm, "PPO")
+    if _require_class(policy, "ActorCritic", "ActorCriticRecurrent") == "ActorCriticRecurrent":
         config["rnn"] = {
             "type": policy.require("rnn_type"),
             "hidden": policy.get("rnn_hidden_dim", 256),
@@ -180,10 +182,9 @@ def agent(data: Mapping[str, Any], report: Report) -> dict[str, Any]:
         symmetry.note("approximated", "data_augmentation_func", how)
     if str(algorithm.get("optimizer", "adam")).lower() != "adam":
         algorithm.note("ignored", "optimizer", "rlcli's ppo uses Adam")
-    algorithm.mark_mapped("class_name", "desired_kl")
+    algorithm.mark_mapped("desired_kl")
     top.mark_mapped(
         "obs_groups",
-        "class_name",
         "logger",
         "neptune_project",
         "wandb_project",
@@ -204,6 +205,25 @@ def agent(data: Mapping[str, Any], report: Report) -> dict[str, Any]:
             top.note("ignored", name, f"use the option {option} of rlcli")
     report.finish(data)
     return config
+
+
+def _require_class(node: Node, *known: str) -> str:
+    """Return the name of RSL-RL's class that settings belong to, without its module; report any class but the known."""
+    value = node.get("class_name", known[0])
+    name = kind_of(value)
+    if name not in known:
+        what = f"the class '{name}' has no counterpart in rlcli, which trains RSL-RL's {' or '.join(known)}"
+        node.report.problem((*node.key, "class_name"), what, f"write {known[0]}, or register another agent")
+    return name
+
+
+def _save_interval(top: Node) -> Any:
+    """Return the number of iterations between checkpoints; None if the setting has another form, which is noted."""
+    value = top.require("save_interval")
+    if isinstance(value, Mapping | list | tuple):
+        top.note("ignored", "save_interval", "rlcli reads a number of iterations; it chooses the checkpoints itself")
+        return None
+    return value
 
 
 def _policy(top: Node) -> Node:

@@ -26,7 +26,8 @@ def import_hint(error: BaseException) -> str | None:
         return None
     name = str(error).partition("'")[2].partition("'")[0]
     known = dir(sys.modules[module]) if module in sys.modules else public_names(module)
-    return did_you_mean(name, known) or _ALL
+    return "; ".join(filter(None, (_NEWER.format(name), did_you_mean(name, known) or _ALL)))
 
 
+_NEWER = "Isaac Lab 2.3.2 has no '{}' (a newer or changed Isaac Lab may have it)"
 _ALL = "docs/guides/isaac-lab.md and docs/reference/isaac-lab-terms.md list the names"

@@ -70,6 +70,14 @@ def absence(name: str, hint: str | None = None) -> TaskError:
     return TaskError(f"{user_place()}{name} cannot be used: {reason}", hint=hint or usual)
 
 
+class MissingMemberError(AttributeError):
+    """Error for a member of an asset or sensor that rlcli does not have."""
+
+    def __init__(self, message: str, hint: str) -> None:
+        super().__init__(message)
+        self.hint = hint
+
+
 def user_place() -> str:
     """Return `file:line: ` of the innermost line of the task's code that is running; empty if none is."""
     from rlcli.registry import is_framework

@@ -78,7 +78,7 @@ class ManagerBasedRLEnv(gymnasium.Env):
         if name.startswith("_") or name in ("managed", "cfg"):
             raise AttributeError(name)
         if not hasattr(self.managed, name):
-            own = _own_class(getattr(self.cfg, "_rlcli_class", None))
+            own = environment_class(getattr(self.cfg, "_rlcli_class", None))
             if own is not None and "_own" not in self.__dict__:
                 self.__dict__["_own"] = object.__new__(own)
                 self._own.__dict__ = self.__dict__  # the object has the attributes of the environment
@@ -277,7 +277,7 @@ class ManagerBasedRLEnv(gymnasium.Env):
 
 
 @functools.cache
-def _own_class(entry: Any) -> type | None:
+def environment_class(entry: Any) -> type | None:
     """Return the environment class that a task defines, a subclass of `ManagerBasedRLEnv`.
 
     `entry` is the class, or its reference `module:Class`. Return None for any other class and for classes of the

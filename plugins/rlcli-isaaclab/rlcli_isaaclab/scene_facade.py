@@ -16,10 +16,12 @@ from rlcli.scene.names import NameProblem
 from rlcli.sim.rotations import conjugate, multiply, rotate, rotate_inverse
 from rlcli_isaaclab.asset_commands import BodyWrench, JointDrive, PhysxView
 from rlcli_isaaclab.asset_data import Data
-from rlcli_isaaclab.missing_names import NoEffect, absence
+from rlcli_isaaclab.missing_names import MissingMemberError, NoEffect, absence
 from rlcli_isaaclab.sensor_facade import FrameTransformer, TerrainImporter, bound, camera_or_sensor, find_elements
 from rlcli_isaaclab.sensor_reader import filter_name
 from rlcli_isaaclab.setup_scene import current_setup
+
+_OWN_CLASS = "if a class of the task defines it: rlcli does not run methods of own asset classes; compute it in a term"
 
 
 class Asset:
@@ -133,15 +135,17 @@ class Asset:
         return self._drives[kind]
 
     def __getattr__(self, name: str) -> Any:
-        if name.startswith("_"):
+        if name.startswith("__"):
             raise AttributeError(name)
+        if name.startswith("_"):
+            raise MissingMemberError(f"an asset of rlcli has no '{name}'", _OWN_CLASS)
         known = [n for n in (*dir(type(self)), *vars(self)) if not n.startswith("_")]
         hint = did_you_mean(name, known) or f"attributes: {listing(known, 40)}"
         if "physx" in name and not did_you_mean(name, known):
             hint = "rlcli has no PhysX; use `data` and the randomization events"
         if "tendon" in name or name.startswith("write_joint_"):
             raise absence(f"Articulation.{name}", hint="use a randomization event, or set the value in the MJCF")
-        raise AttributeError(f"an asset has no '{name}'; {hint}")
+        raise MissingMemberError(f"an asset has no '{name}'; {hint}", _OWN_CLASS)
 
     def find_joints(self, name_keys: Any, joint_subset: Any = None, preserve_order: bool = False) -> Any:
         """Return (indices, names) of the joints whose names match `name_keys`, names or regexes."""

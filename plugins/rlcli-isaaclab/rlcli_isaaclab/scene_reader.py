@@ -14,6 +14,7 @@ from rlcli_isaaclab.collection import entity_name
 from rlcli_isaaclab.light_reader import read_light
 from rlcli_isaaclab.missing_names import AbsentValue, reason_of
 from rlcli_isaaclab.model_lookup import given_models, is_end_of, mjcf_of, model_hint
+from rlcli_isaaclab.own_classes import note_own_class
 from rlcli_isaaclab.sensor_reader import camera_kinds, filter_name, image_name, read_filters, read_sensor
 from rlcli_isaaclab.settings import Key, Node, Report, as_float, base_kind, kind_of
 from rlcli_isaaclab.terrain_reader import read_friction, read_ground, read_terrain
@@ -98,7 +99,7 @@ class SceneReader:
                 for index, filtered in enumerate(read_filters(item, sensor, self.prims)):
                     self.sensors[filter_name(item.key[-1], index)] = filtered
         for kind, item in own:
-            item.note("approximated", "class_type", f"read as a {kind}; the methods of the task's class do not run")
+            note_own_class(item, kind)
         config["ground"] = ground
         config["lights"] = lights
         if not self.entities and not self.report.problems:

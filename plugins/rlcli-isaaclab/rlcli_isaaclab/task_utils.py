@@ -7,6 +7,7 @@ import pkgutil
 from typing import Any
 
 from rlcli.registry.failed_imports import failed_import
+from rlcli_isaaclab.missing_names import user_place
 
 
 def import_packages(package_name: str, blacklist_pkgs: list[str] | None = None) -> None:
@@ -20,7 +21,7 @@ def import_packages(package_name: str, blacklist_pkgs: list[str] | None = None) 
             try:
                 import_packages(found.name, blacklist_pkgs)
             except Exception as error:
-                failed_import(found.name, error)
+                failed_import(found.name, error, user_place().removesuffix(": "))
 
 
 def load_cfg_from_registry(task_name: str, entry_point_key: str) -> Any:

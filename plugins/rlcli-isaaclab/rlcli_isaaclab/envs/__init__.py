@@ -61,13 +61,16 @@ class ManagerBasedEnvCfg:
         """Return this configuration as a task of rlcli; `models` are the values of `--model`, NAME -> FILE."""
         from rlcli.config.python_task import PythonTask
         from rlcli_isaaclab.convert import task
+        from rlcli_isaaclab.own_classes import WORKFLOW, warn_of_methods
+        from rlcli_isaaclab.runtime import environment_class
         from rlcli_isaaclab.settings import Report
 
         report = Report()
         entry = getattr(self, "_rlcli_class", OWN_CLASS)
         if entry not in (OWN_CLASS, ManagerBasedRLEnv):
             why = "terms can call methods of the task's own environment class; rlcli itself calls none of them"
-            report.entries[("entry_point",)] = ("ignored", why)
+            skipped = warn_of_methods("the environment", environment_class(entry), WORKFLOW)
+            report.entries[("entry_point",)] = ("ignored", f"{why}; {skipped}" if skipped else why)
         data = task(to_dict(self), report, root, models=models, cfg=self)
         return PythonTask(data, notes=report.user_notes())
 
