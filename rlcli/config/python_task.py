@@ -300,11 +300,9 @@ def _registered(source: TaskSource) -> tuple[Any, dict[str, Any]]:
             import_file(file)
     found = {
         name: kwargs
-        for name, kwargs in registrations.items()
-        if _module_of(kwargs[CONFIGURATION]).startswith(module.__name__)
+        for name, kwargs in registrations.items()  # the configuration of the wanted task may be another package's
+        if name == wanted or _module_of(kwargs[CONFIGURATION]).startswith(module.__name__)
     }
-    if wanted in registrations:  # the configuration may belong to another package
-        found[wanted] = registrations[wanted]
     if wanted and wanted not in found:
         known = did_you_mean(wanted, found) or f"registered tasks: {listing(found)}"
         scripts = files_that_register(source.root, wanted)
