@@ -33,7 +33,7 @@ class Adam(torch.optim.Adam):
     add_param_group = inspect.unwrap(torch.optim.Adam.add_param_group)
 
 
-def below(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
+def tensors_with_prefix(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
     """Return the tensors whose names start with `prefix`, by their names without the prefix."""
     return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
 
@@ -58,7 +58,7 @@ def load_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tenso
         ValueError: with the first tensor that is missing or has another shape.
     """
     state: dict[int, dict[str, Tensor]] = {}
-    for name, value in below(tensors, prefix).items():
+    for name, value in tensors_with_prefix(tensors, prefix).items():
         number, slot = name.split(".")
         state.setdefault(int(number), {})[slot] = value.clone()
     _require_slots(optimizer, state)
