@@ -23,9 +23,9 @@ from rlcli.errors import UsageError
 from rlcli.evaluation.session import PolicyRequest, open_session, run_episodes
 from rlcli.registry.find import find_task
 from rlcli.rl.action_functions import trained_policy
+from rlcli.runs.checkpoint_fit import require_fit
 from rlcli.runs.checkpoint_reader import open_checkpoint
 from rlcli.runs.policy_ref import choose
-from rlcli.runs.restore import require_fit
 from rlcli.runs.run_ref import default_runs_dir
 from rlcli.safe_text import MAX_SEED, shorten
 from rlcli.training.job import Job, TrainingResult

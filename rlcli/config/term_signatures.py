@@ -20,8 +20,8 @@ from typing import Any, Literal, Self, Union
 from pydantic import ConfigDict, Field, create_model
 
 from rlcli.config import schema
+from rlcli.config.class_search import ClassSearch, SourceClass, constructor, last_name, parse
 from rlcli.config.strict_yaml import Path as KeyPath
-from rlcli.config.unimported_classes import ClassSearch, SourceClass, constructor, last_name, parse
 
 SECTIONS: dict[str, type[schema.TermConfig]] = {
     "actions": schema.ActionConfig,

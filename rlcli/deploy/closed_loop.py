@@ -40,10 +40,10 @@ from rlcli.registry import TaskSource
 from rlcli.rl.action_functions import trained_policy
 from rlcli.rl.policy import Policy
 from rlcli.rl.rng import seed_generators
+from rlcli.runs.checkpoint_fit import require_fit
 from rlcli.runs.checkpoint_reader import Checkpoint
 from rlcli.runs.layout_and_deployment import deployment_differences
 from rlcli.runs.policy_ref import Choice
-from rlcli.runs.restore import require_fit
 
 _log = logging.getLogger(__name__)
 

@@ -240,8 +240,8 @@ def make_actor(policy: PolicyInTask) -> Callable[[VecEnv], Act]:
 
     from rlcli.random import derive
     from rlcli.rl.action_functions import random_policy, trained_policy, zero_policy
+    from rlcli.runs.checkpoint_fit import require_fit
     from rlcli.runs.checkpoint_reader import open_checkpoint
-    from rlcli.runs.restore import require_fit
 
     torch.set_num_threads(1)
     agent, seed = policy.resolved.agent, derive(policy.seed, "play")

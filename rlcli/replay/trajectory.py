@@ -39,7 +39,7 @@ from rlcli.errors import CheckpointError
 from rlcli.registry import TaskSource
 from rlcli.runs.atomic_io import disk_errors, write_atomic
 from rlcli.runs.provenance import model_digest
-from rlcli.runs.restore import recorded_task
+from rlcli.runs.recorded_task import recorded_task
 from rlcli.runs.safe_io import check_json
 from rlcli.runs.tensor_bytes import tensor_bytes
 from rlcli.sim.divergence_report import MAX_DESCRIBED

@@ -29,7 +29,7 @@ from rlcli.reporting.curves import AXES, Curve, gather
 from rlcli.reporting.task_card import Card, card, task_card
 from rlcli.runs.checkpoint_reader import open_checkpoint
 from rlcli.runs.config_diff import as_text
-from rlcli.runs.restore import recorded_task, resolve_run
+from rlcli.runs.recorded_task import recorded_task, resolve_run
 from rlcli.runs.run import Run
 
 _MAX_CHARACTERS = 2000

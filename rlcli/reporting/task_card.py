@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from rlcli.config.class_search import ClassSearch
 from rlcli.config.layers import leaves
 from rlcli.config.load import Resolved
 from rlcli.config.messages import dotted
@@ -27,7 +28,6 @@ from rlcli.config.schema import (
     bound_text,
 )
 from rlcli.config.term_signatures import SECTIONS, SELECTORS, SignatureError, Vocabulary, first_paragraph, read_params
-from rlcli.config.unimported_classes import ClassSearch
 from rlcli.registry import TaskSource
 from rlcli.reporting.card_text import columns_text, modifier_text, noise_text, number, span, text_of, when_text
 

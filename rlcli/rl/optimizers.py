@@ -30,7 +30,7 @@ class Adam(torch.optim.Adam):
     add_param_group = inspect.unwrap(torch.optim.Adam.add_param_group)
 
 
-def below(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
+def tensors_with_prefix(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
     """Return the tensors whose names start with `prefix`, by their names without the prefix."""
     return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
 
@@ -56,7 +56,7 @@ def load_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tenso
         ValueError: if a tensor is missing, has another shape, or is of a parameter that the optimiser does not have.
     """
     state: dict[int, dict[str, Tensor]] = {}
-    for name, value in below(tensors, prefix).items():
+    for name, value in tensors_with_prefix(tensors, prefix).items():
         number, slot = name.split(".")
         state.setdefault(int(number), {})[slot] = value.clone()
     _require_slots(optimizer, state)

@@ -13,7 +13,7 @@ from rlcli.registry.find import path_of
 from rlcli.registry.task_location import task_reference
 from rlcli.runs.checkpoint_reader import Checkpoint
 from rlcli.runs.policy_bundle import is_bundle, open_bundle
-from rlcli.runs.restore import recorded_task, source_of
+from rlcli.runs.recorded_task import recorded_task, source_of
 from rlcli.runs.run import Run
 from rlcli.runs.run_ref import find_checkpoint, is_same_task, list_runs
 

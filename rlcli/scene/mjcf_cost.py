@@ -33,6 +33,9 @@ REFERENCES = {
 _CHAIN = 4
 """Length of the longest chain of references that is followed: tuple -> sensor -> actuator -> tendon."""
 
+_GROWING = ("size", "elements", "referring", "keys", "assets")
+"""Parts of a model's cost that are proportional to its number of copies."""
+
 
 @dataclass(frozen=True, slots=True)
 class ModelCost:
@@ -62,15 +65,10 @@ class ModelCost:
     def beside(self, other: ModelCost) -> ModelCost:
         """Return the cost of a model that has the elements of this model and of `other`."""
         names = self.stored.keys() | other.stored.keys()
-        return ModelCost(
-            min(self.size + other.size, ENDLESS),
-            min(self.loads + other.loads, ENDLESS),
-            min(self.elements + other.elements, ENDLESS),
-            min(self.referring + other.referring, ENDLESS),
-            {name: max(self.stored.get(name, 0.0), other.stored.get(name, 0.0)) for name in names},
-            min(self.keys + other.keys, ENDLESS),
-            min(self.assets + other.assets, ENDLESS),
-        )
+        stored = {name: max(self.stored.get(name, 0.0), other.stored.get(name, 0.0)) for name in names}
+        summed = ("loads", *_GROWING)
+        sums = {name: min(getattr(self, name) + getattr(other, name), ENDLESS) for name in summed}
+        return ModelCost(stored=stored, **sums)
 
     def loading(self, other: ModelCost) -> ModelCost:
         """Return the cost of this model if it also reads the model `other`, to attach it."""
@@ -84,8 +82,7 @@ class ModelCost:
             with_loads: whether the result has `loads`, which does not grow with the number of copies; False if the
                 caller has counted `loads` already.
         """
-        grows = ("size", "elements", "referring", "keys", "assets")
-        scaled = {name: min(getattr(self, name) * copies, ENDLESS) for name in grows}
+        scaled = {name: min(getattr(self, name) * copies, ENDLESS) for name in _GROWING}
         return replace(self, loads=self.loads if with_loads else 0.0, **scaled)
 
 

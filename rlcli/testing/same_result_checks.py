@@ -28,8 +28,8 @@ from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import ConfigError, DeviceError, RlcliError, pip_install
 from rlcli.machine.plain_files import read_plain
 from rlcli.rl.rng import rng_state
+from rlcli.runs.checkpoint_fit import require_fit
 from rlcli.runs.policy_bundle import open_bundle
-from rlcli.runs.restore import require_fit
 from rlcli.runs.safe_io import JSON_LIMIT
 from rlcli.testing.episode_checks import compare_trajectories
 from rlcli.testing.findings import Finding, NotRunError, error_at, warning_at

@@ -23,7 +23,7 @@ from rlcli.deploy.env_description import describe
 from rlcli.envs.make import make_env
 from rlcli.errors import CheckpointError, one_line
 from rlcli.machine.memory import available_memory
-from rlcli.rl.optimizers import below
+from rlcli.rl.optimizers import tensors_with_prefix
 from rlcli.rl.policy import blank_policy, filled
 from rlcli.rl.trainer import TrainerState
 from rlcli.runs.provenance import environment_record
@@ -114,12 +114,12 @@ def read_rsl_rl(file: Path, *, activation: str | None = None, action_bound: floa
     if saved.get("actor_state_dict") is not None:  # version 5
         weights = _named_tensors(saved["actor_state_dict"], where)
         critic = _named_tensors(saved.get("critic_state_dict", {}), where)
-        hidden, lstm, stats = "mlp.", "rnn.rnn.", below(weights, "obs_normalizer.")
+        hidden, lstm, stats = "mlp.", "rnn.rnn.", tensors_with_prefix(weights, "obs_normalizer.")
         std = {"std": "distribution.std_param", "log_std": "distribution.log_std_param"}
     else:  # versions 2 to 4
         weights = _named_tensors(saved.get("model_state_dict"), where)
         critic = {name: value for name, value in weights.items() if name.startswith(("critic", "memory_c"))}
-        hidden, lstm, stats = "actor.", "memory_a.rnn.", below(weights, "actor_obs_normalizer.")
+        hidden, lstm, stats = "actor.", "memory_a.rnn.", tensors_with_prefix(weights, "actor_obs_normalizer.")
         if not stats and "obs_norm_state_dict" in saved:
             stats = _named_tensors(saved["obs_norm_state_dict"], where)
         std = {"std": "std", "log_std": "log_std"}
@@ -287,7 +287,7 @@ def _lstm(weights: Mapping[str, Tensor], prefix: str, file: Path) -> tuple[dict[
     The names of the LSTM's weights begin with `prefix`.
     """
     lstm: dict[str, Tensor] = {}
-    for name, value in below(weights, prefix).items():
+    for name, value in tensors_with_prefix(weights, prefix).items():
         kind, _, layer = name.rpartition("_l")
         if kind not in ("weight_ih", "weight_hh", "bias_ih", "bias_hh") or not (layer.isdecimal() and len(layer) < 3):
             raise CheckpointError(f"{file}: {prefix}{name[:60]} is no weight of an LSTM; other RNNs cannot be imported")

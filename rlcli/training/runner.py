@@ -25,7 +25,7 @@ from rlcli.rl.budget import Budget
 from rlcli.rl.trainer import Trainer
 from rlcli.runs.checkpoint_reader import steps
 from rlcli.runs.provenance import built_record, differences, environment_record
-from rlcli.runs.restore import resolve_run
+from rlcli.runs.recorded_task import resolve_run
 from rlcli.runs.run import Run
 from rlcli.training.checkpoint_writer import CheckpointWriter, KeepRule, manifest_entries
 from rlcli.training.health import Health

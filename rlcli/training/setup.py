@@ -16,8 +16,8 @@ from rlcli.rl import distributed
 from rlcli.rl.rng import seed_generators
 from rlcli.rl.trainer import Trainer, TrainerState
 from rlcli.runs.atomic_io import write_atomic
+from rlcli.runs.checkpoint_fit import require_fit, require_same_policy, require_trainer
 from rlcli.runs.checkpoint_reader import Checkpoint, open_checkpoint
-from rlcli.runs.restore import require_fit, require_same_policy, require_trainer
 from rlcli.training.checkpoint_writer import drop_after
 from rlcli.training.job import Job, threads
 

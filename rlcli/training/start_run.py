@@ -203,7 +203,7 @@ def resume_run(request: TrainingRequest) -> Job | TrainingResult:
         MachineError: if another process writes to the run.
     """
     from rlcli.runs.checkpoint_reader import open_checkpoint
-    from rlcli.runs.restore import resolve_run
+    from rlcli.runs.recorded_task import resolve_run
     from rlcli.runs.run_ref import is_checkpoint_ref
 
     run, folder, why = _find_checkpoint(request)
@@ -290,7 +290,7 @@ def _job_of_other_rank(message: dict[str, Any], request: TrainingRequest, resolv
     Such a rank does not write the run.
     """
     from rlcli.runs.checkpoint_reader import open_checkpoint
-    from rlcli.runs.restore import resolve_run
+    from rlcli.runs.recorded_task import resolve_run
 
     folder = Path(message["run"])
     run = open_run(folder) if resolved is None else Run(folder, message["record"])

@@ -186,7 +186,7 @@ def _request_of_sweep(sweep: Sweep, request: TrainingRequest) -> Iterator[Traini
     The copy keeps the budget, the device and the overrides of the request. During the block, a temporary file has the
     content of the sweep's `--config` file.
     """
-    from rlcli.runs.restore import recorded_task
+    from rlcli.runs.recorded_task import recorded_task
 
     settings = sweep.settings
     source = recorded_task(settings["source"], f"the task of {sweep.folder}")

@@ -7,8 +7,8 @@ import torch
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import CheckpointError
 from rlcli.rl.action_functions import Act, trained_policy
+from rlcli.runs.checkpoint_fit import require_fit
 from rlcli.runs.checkpoint_reader import open_checkpoint, steps
-from rlcli.runs.restore import require_fit
 from rlcli.runs.run import Run
 
 

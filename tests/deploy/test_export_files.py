@@ -23,7 +23,7 @@ from rlcli.envs.make import make_env
 from rlcli.errors import VerdictError
 from rlcli.registry import find_task
 from rlcli.runs.checkpoint_reader import open_checkpoint
-from rlcli.runs.restore import resolve_run
+from rlcli.runs.recorded_task import resolve_run
 from rlcli.runs.run import open_run
 from rlcli.runs.run_ref import find_run
 

@@ -9,8 +9,8 @@ from rlcli.config.load import resolve
 from rlcli.envs.make import make_env
 from rlcli.errors import CheckpointError
 from rlcli.registry import find_task
+from rlcli.runs.checkpoint_fit import require_fit
 from rlcli.runs.checkpoint_reader import open_checkpoint
-from rlcli.runs.restore import require_fit
 
 
 def layout_of(task, *overrides):

@@ -18,7 +18,7 @@ WARM = (
     "rlcli.rl.sb3.trainer", "rlcli.rl.ppo.trainer",
     "rlcli.training.setup", "rlcli.training.runner",
     "rlcli.training.loggers", "rlcli.training.checkpoint_writer", "rlcli.training.loop",
-    "rlcli.training.periodic_eval", "rlcli.training.start_run", "rlcli.runs.restore",
+    "rlcli.training.periodic_eval", "rlcli.training.start_run", "rlcli.runs.recorded_task",
     "tensorboard.summary.writer.record_writer", "torch._dynamo", "rlcli.mdp", "rlcli_tasks.cartpole",
     "tensorboard.backend.event_processing.event_file_loader", "tensorboard.summary.writer.record_writer", "rich.live",
 )  # fmt: skip

@@ -146,7 +146,7 @@ def test_training_continues_if_video_cannot_be_written(cli):
 def test_video_is_aborted_when_training_stops(cli, caplog):
     from rlcli.envs.make import make_env
     from rlcli.runs.checkpoint_reader import open_checkpoint
-    from rlcli.runs.restore import resolve_run
+    from rlcli.runs.recorded_task import resolve_run
     from rlcli.runs.run import open_run
 
     assert cli("train", *SMALL, *PICTURE, "--max-iterations", 1, "--name", "a").code == 0

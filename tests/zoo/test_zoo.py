@@ -22,10 +22,10 @@ from rlcli.config.load import resolve  # noqa: E402
 from rlcli.deploy.env_description import describe  # noqa: E402
 from rlcli.envs.make import make_env  # noqa: E402
 from rlcli.registry import find_task  # noqa: E402
+from rlcli.runs.checkpoint_fit import require_fit  # noqa: E402
 from rlcli.runs.checkpoint_reader import open_checkpoint  # noqa: E402
 from rlcli.runs.layout_and_deployment import deployment_differences  # noqa: E402
 from rlcli.runs.policy_bundle import open_bundle  # noqa: E402
-from rlcli.runs.restore import require_fit  # noqa: E402
 from rlcli.testing import check_task, lint_task  # noqa: E402
 from rlcli.testing.host_sync import HostSyncGuard  # noqa: E402
 

@@ -16,7 +16,7 @@ from rlcli.envs.environment_protocol import Environment
 from rlcli.errors import ConfigError
 from rlcli.random import derive
 from rlcli.rl.nan_check import require_finite_learner
-from rlcli.rl.optimizers import below, load_optimizer, optimizer_tensors
+from rlcli.rl.optimizers import load_optimizer, optimizer_tensors, tensors_with_prefix
 from rlcli.rl.policy import PolicySpec
 from rlcli.rl.rng import load_rng_state, rng_state, seed_generators
 from rlcli.rl.trainer import Report, TrainerState
@@ -153,7 +153,7 @@ class RlGamesTrainer(BaseTrainer):
         """Restore a saved state. On a CPU the next iteration is bit-identical to the one that followed the save."""
         values, rest = state.values, state.tensors["trainer"]
         for part, module in self._modules().items():
-            module.load_state_dict(below(rest, f"{part}."))
+            module.load_state_dict(tensors_with_prefix(rest, f"{part}."))
         for name, optimizer in self._optimizers().items():
             load_optimizer(optimizer, rest, f"optimizer.{name}.")
         self.agent.dones = rest["dones"].clone()

@@ -18,7 +18,7 @@ from rlcli.envs.environment_protocol import Environment
 from rlcli.random import derive
 from rlcli.registry import is_offered, load_object
 from rlcli.rl.nan_check import require_finite_learner
-from rlcli.rl.optimizers import below, load_optimizer, optimizer_tensors
+from rlcli.rl.optimizers import load_optimizer, optimizer_tensors, tensors_with_prefix
 from rlcli.rl.policy import PolicySpec
 from rlcli.rl.rng import load_rng_state, rng_state, seed_generators
 from rlcli.rl.trainer import Report, TrainerState
@@ -120,14 +120,14 @@ class RslRlTrainer(BaseTrainer):
         """Restore a saved state. On a CPU the next iteration is bit-identical to the one that followed the save."""
         values, rest = state.values, state.tensors["trainer"]
         for part, module in self._modules().items():
-            module.load_state_dict(below(rest, f"{part}."))
+            module.load_state_dict(tensors_with_prefix(rest, f"{part}."))
         for name, optimizer in self._optimizers().items():
             load_optimizer(optimizer, rest, f"optimizer.{name}.")
         self.alg.learning_rate = values["learning_rate"]
         for group in self.alg.optimizer.param_groups:
             group["lr"] = values["learning_rate"]
         for part, network in (("actor", self.alg.actor), ("critic", self.alg.critic)):
-            memory = below(rest, f"memory.{part}.")
+            memory = tensors_with_prefix(rest, f"memory.{part}.")
             if memory:
                 network.reset(hidden_state=tuple(memory[str(index)].clone() for index in range(len(memory))))
         if self.alg.rnd:

@@ -74,8 +74,8 @@ def _train_again(original: Run, until: int, runs: Path, name: str, force: bool) 
     from rlcli.cli.ui.progress_view import TrainingView
     from rlcli.machine.cores import available_cores
     from rlcli.runs.provenance import built_record, environment_record
+    from rlcli.runs.recorded_task import resolve_run
     from rlcli.runs.reproduction import changed_entries, create_reproduction, milestones
-    from rlcli.runs.restore import resolve_run
     from rlcli.training.job import Job
     from rlcli.training.signals import StopRequest
     from rlcli.training.start_run import setup_job

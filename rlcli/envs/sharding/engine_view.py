@@ -7,6 +7,7 @@ Observers, recordings and reports use the object like the engine of a single pro
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import mujoco
@@ -60,7 +61,7 @@ class ShardedEngine:
         self.shared_streams: int = self._local.shared_streams
         self.state_layout: StateLayout = self._local.state_layout
         self.forces_after_reset: bool = self._local.forces_after_reset
-        self.threads: int = sum(shards.call_all(_threads))
+        self.threads: int = sum(shards.call_all(attrgetter("engine.threads")))
 
     @property
     def replayable(self) -> ShardedEngine:
@@ -88,12 +89,12 @@ class ShardedEngine:
     @property
     def warnings(self) -> dict[str, int]:
         """Number of MuJoCo's warnings that are no divergence, by name."""
-        return sums(self._shards.call_all(_warnings))
+        return sums(self._shards.call_all(attrgetter("engine.warnings")))
 
     @property
     def divergence_causes(self) -> dict[str, int]:
         """Number of divergences since the start, by cause."""
-        return sums(self._shards.call_all(_divergence_causes))
+        return sums(self._shards.call_all(attrgetter("engine.divergence_causes")))
 
     def field(self, name: str) -> Tensor:
         """Return a copy of an MjData field. (num_envs, ...)"""
@@ -131,18 +132,6 @@ def sums(counts: Sequence[Mapping[str, N]]) -> dict[str, N]:
     """Return the sum of the counts of all shards for each name, in one mapping."""
     names = dict.fromkeys(name for count in counts for name in count)
     return {name: sum(count.get(name, 0) for count in counts) for name in names}
-
-
-def _threads(env: VecEnv) -> int:
-    return env.engine.threads
-
-
-def _warnings(env: VecEnv) -> dict[str, int]:
-    return dict(env.engine.warnings)
-
-
-def _divergence_causes(env: VecEnv) -> dict[str, int]:
-    return dict(env.engine.divergence_causes)
 
 
 def _field(env: VecEnv, name: str) -> Tensor:

@@ -7,6 +7,7 @@ import pickle
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from operator import attrgetter, methodcaller
 from typing import Any
 
 import torch
@@ -161,8 +162,8 @@ class ShardedEnv(Environment):
         return len(self._shards)
 
     def compute_success(self) -> Tensor | None:
-        """Return where all conditions of success hold in the current state; None without conditions. (num_envs,)"""
-        parts = self.call_all(_success)
+        """Return where all conditions of success hold in the current state; None without conditions. (num_envs,) bool"""
+        parts = self.call_all(methodcaller("compute_success"))
         return None if parts[0] is None else torch.cat(parts)
 
     def check(self) -> None:
@@ -174,18 +175,18 @@ class ShardedEnv(Environment):
 
     def step_metrics(self) -> dict[str, Tensor]:
         """Return the values that a direct task wrote to `extras` in this step, by name. (num_envs,) each"""
-        return _joined_rows(self.call_all(_step_metrics))
+        return _joined_rows(self.call_all(methodcaller("step_metrics")))
 
     def reset_metrics(self) -> dict[str, Tensor]:
         """Return the values that a task logged about the episodes that ended in this step, by name. (num_envs,) each"""
-        return _joined_rows(self.call_all(_reset_metrics))
+        return _joined_rows(self.call_all(methodcaller("reset_metrics")))
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return copies of everything that the next steps depend on, the same tensors as in a single process."""
         # of all saved values, only the means that curriculum terms log are computed over all environments
         logged = {name.removeprefix("Curriculum/"): value for name, value in self._metric_values().items()}
         averages = {f"workflow.curriculum.value.{name}": mean_of(value) for name, value in logged.items()}
-        states = self.call_all(_state)
+        states = self.call_all(methodcaller("state_dict"))
         return join_states(
             [state | {name: averages[name] for name in averages.keys() & state.keys()} for state in states]
         )
@@ -211,7 +212,7 @@ class ShardedEnv(Environment):
     @property
     def causes(self) -> dict[str, int]:
         """Number of diverged simulations since the start, by cause."""
-        return sums(self.call_all(_causes))
+        return sums(self.call_all(attrgetter("causes")))
 
     @property
     def reward_names(self) -> list[str]:
@@ -253,7 +254,7 @@ class ShardedEnv(Environment):
     def call_all(self, function: Callable[..., Any], *arguments: Any) -> list[Any]:
         """Return the results of `function(vec_env, *arguments)`, called in every shard, in order.
 
-        `function` must be defined in a module.
+        `function` must be defined in a module, or be an `operator.attrgetter` or `methodcaller`.
         """
         self._require_usable()
         self._workers.request(worker.CALL, (function, arguments))
@@ -363,7 +364,7 @@ class ShardedEnv(Environment):
         return self._last_obs
 
     def _metric_values(self) -> dict[str, Tensor]:
-        parts = self.call_all(_metric_values)
+        parts = self.call_all(methodcaller("metric_values"))
         return {name: self._joined_metric([part[name] for part in parts]) for name in _common_names(parts)}
 
     def _joined_metric(self, parts: Sequence[Tensor]) -> Tensor:
@@ -408,26 +409,6 @@ def _pickled(resolved: Resolved) -> bytes:
         raise ConfigError([resolved.problem(("scene", "workers"), message, hint)]) from None
 
 
-def _success(env: VecEnv) -> Tensor | None:
-    return env.compute_success()
-
-
-def _divergence_metrics(env: VecEnv) -> dict[str, float]:
-    return env.divergence_metrics()
-
-
-def _metric_values(env: VecEnv) -> dict[str, Tensor]:
-    return env.metric_values()
-
-
-def _step_metrics(env: VecEnv) -> dict[str, Tensor]:
-    return env.step_metrics()
-
-
-def _reset_metrics(env: VecEnv) -> dict[str, Tensor]:
-    return env.reset_metrics()
-
-
 def _joined_rows(parts: Sequence[dict[str, Tensor]]) -> dict[str, Tensor]:
     return {name: torch.cat([part[name] for part in parts]) for name in _common_names(parts)}
 
@@ -435,10 +416,6 @@ def _joined_rows(parts: Sequence[dict[str, Tensor]]) -> dict[str, Tensor]:
 def _common_names(parts: Sequence[dict[str, Tensor]]) -> list[str]:
     """Return the names that all shards have: a task may log a value only after the first episode has ended."""
     return [name for name in parts[0] if all(name in part for part in parts)]
-
-
-def _state(env: VecEnv) -> dict[str, Tensor]:
-    return env.state_dict()
 
 
 def _state_shapes(env: VecEnv) -> dict[str, torch.Size]:

@@ -20,7 +20,7 @@ from rlcli.rl.budget import remaining_budget
 from rlcli.rl.cuda_graph import capture_on_gpu
 from rlcli.rl.mlp import use_threads
 from rlcli.rl.nan_check import require_finite
-from rlcli.rl.optimizers import below
+from rlcli.rl.optimizers import tensors_with_prefix
 from rlcli.rl.ppo.collector import Collector
 from rlcli.rl.ppo.config import PpoConfig
 from rlcli.rl.ppo.learner import Learner
@@ -183,7 +183,7 @@ class PpoTrainer(BaseTrainer):
         """Load the weights and the normaliser of a saved policy (`--init-from`); the critic does not change."""
         self.networks.load_policy_tensors(policy)
         if self.collector.normalizer is not None:
-            self.collector.normalizer.load_state_dict(below(policy, "normalizer."))
+            self.collector.normalizer.load_state_dict(tensors_with_prefix(policy, "normalizer."))
 
     def policy_tensors(self) -> dict[str, Tensor]:
         """Return copies of the policy's weights, by their names in a saved policy."""

@@ -19,7 +19,7 @@ from rlcli.errors import DivergedError
 from rlcli.random import derive
 from rlcli.rl.budget import remaining_budget
 from rlcli.rl.nan_check import LEARNER_HINT, GradientWatch, moments, require_finite, require_finite_learner
-from rlcli.rl.optimizers import below, load_optimizer, optimizer_tensors
+from rlcli.rl.optimizers import load_optimizer, optimizer_tensors, tensors_with_prefix
 from rlcli.rl.policy import Normalizer
 from rlcli.rl.rng import load_rng_state, rng_state
 from rlcli.rl.sb3.config import OffPolicyConfig, OnPolicyConfig, Sb3Config
@@ -212,7 +212,7 @@ class Sb3Trainer(BaseTrainer):
         if rest is None and hasattr(self.model, "actor_target"):
             self.model.actor_target.load_state_dict(self.model.actor.state_dict())
         if self.normalizer is not None:
-            self.normalizer.load_state_dict(below(policy, "normalizer."))
+            self.normalizer.load_state_dict(tensors_with_prefix(policy, "normalizer."))
 
     def _optimizers(self) -> dict[str, torch.optim.Optimizer]:
         if isinstance(self.config, OnPolicyConfig):
