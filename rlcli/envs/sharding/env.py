@@ -162,7 +162,7 @@ class ShardedEnv(Environment):
         return len(self._shards)
 
     def compute_success(self) -> Tensor | None:
-        """Return where all conditions of success hold in the current state; None without conditions. (num_envs,) bool"""
+        """Return where all conditions of success hold now; None without conditions. (num_envs,) bool"""
         parts = self.call_all(methodcaller("compute_success"))
         return None if parts[0] is None else torch.cat(parts)
 
@@ -171,7 +171,7 @@ class ShardedEnv(Environment):
 
     def extras(self) -> dict[str, float]:
         """Return the values to log, by the names of the metrics; see `Environment.extras`."""
-        return {**means(self._metric_values()), **sums(self.call_all(_divergence_metrics))}
+        return {**means(self._metric_values()), **sums(self.call_all(methodcaller("divergence_metrics")))}
 
     def step_metrics(self) -> dict[str, Tensor]:
         """Return the values that a direct task wrote to `extras` in this step, by name. (num_envs,) each"""
