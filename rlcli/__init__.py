@@ -1,3 +1,3 @@
-"""rlcli: train, play, evaluate and export robot-control policies in MuJoCo. The import has no side effects."""
+"""rlcli: train, play, evaluate and export robot-control policies in MuJoCo. `rlcli.api` is the Python interface."""
 
 __version__ = "0.1.0"

@@ -1,7 +1,7 @@
 """Entry point of `python -m rlcli`, which is the same as the command `rlcli`.
 
-Python puts the current folder first on `sys.path`. It is removed here, because the command `rlcli` does not import from
-the current folder either.
+Python puts the current folder first on `sys.path`. This module removes the folder again, because the command `rlcli`
+does not import from the current folder either.
 """
 
 import os

@@ -1,4 +1,4 @@
-"""Python interface: make an environment, train, evaluate, act with a trained policy, and export it.
+"""Python interface: make environments, train a policy, evaluate it, act with it, and export it.
 
 `train`, `evaluate` and `export` do the work of the commands `rlcli train`, `rlcli eval` and `rlcli export`, and return
 the result instead of printing it. Errors are the exceptions of `rlcli.errors`.
@@ -41,18 +41,19 @@ if TYPE_CHECKING:
 def make(
     task: str, *, num_envs: int | None = None, seed: int = 42, device: str = "cpu", overrides: Sequence[str] = ()
 ) -> VecEnv:
-    """Return the vectorized environment of a task, as `VecEnv`.
+    """Return the environments of a task, which are stepped together, as one `VecEnv`.
 
     Args:
         task: name of an installed task, or the path of a task folder.
-        num_envs: number of environments; None takes the task's own.
+        num_envs: number of environments; None: the number in the task's configuration.
         seed: seed of all random numbers.
-        device: `cpu`, or `cuda` for MuJoCo Warp.
-        overrides: list of `key.path=value`, as on the command line.
+        device: `cpu`, or `cuda` for the physics engine MuJoCo Warp on the GPU.
+        overrides: changes of the task's configuration: list of `key.path=value`, as on the command line.
 
     Raises:
         TaskError: if the task is not found.
         ConfigError: if an override or the configuration of the task is not valid.
+        DeviceError: if the device is not available.
         UsageError: if `seed` is not an integer from 0 to 2^62, or `overrides` is a string instead of a list.
     """
     _check(seed, overrides)
@@ -74,30 +75,31 @@ def train(
     resume: Path | str | None = None,
     on_progress: Callable[[Progress], None] | None = None,
 ) -> TrainingResult:
-    """Train a policy and return the finished run.
+    """Train a policy, or resume a training, and return the result at the end.
 
-    Call it from the main thread: SIGINT and SIGTERM stop the training after a checkpoint is written.
+    Call this function in the main thread. During the call, SIGINT and SIGTERM save a checkpoint and stop the training.
 
     Args:
         task: name of an installed task, or the path of a task folder; not needed with `resume`.
-        agent: name of an agent of the task; None takes the default agent.
-        num_envs: number of environments; None takes the task's own.
-        max_iterations: iterations to train; None takes the agent's own.
+        agent: name of an agent of the task; None: the default agent.
+        num_envs: number of environments; None: the number in the task's configuration.
+        max_iterations: number of iterations, counted from the start of the training; None: the agent's budget.
         seed: seed of the training.
         device: `auto`, `cpu` or `cuda`.
-        overrides: list of `key.path=value`; `agent.key=value` changes the agent.
+        overrides: changes of the configuration: list of `key.path=value`; `agent.key=value` changes the agent.
         runs_dir: folder of the runs; None: the environment variable RLCLI_RUNS_DIR, else `runs`.
         name: text to add to the name of the run's folder, to recognise the run.
-        resume: folder of a run to resume.
+        resume: folder of a run to resume; None: a new run.
         on_progress: called with a `Progress` (iteration, steps, metrics) after each iteration.
 
     Raises:
-        RlcliError: in every case in which `rlcli train` would end with an error.
+        Stopped: if a signal has stopped the training; the run can be resumed.
+        RlcliError: in every other case in which `rlcli train` would end with an error.
     """
     _check(seed, overrides)
     if task is None and resume is None:
         raise UsageError(
-            "train(): no task and no run to resume given", hint='write train("cartpole") or train(resume=RUN)'
+            "train(): neither a task nor a run to resume is given", hint='write train("cartpole") or train(resume=RUN)'
         )
     request = TrainingRequest(
         Path(runs_dir or default_runs_dir()),
@@ -133,22 +135,23 @@ def evaluate(
     overrides: Sequence[str] = (),
     runs_dir: Path | str | None = None,
 ) -> dict[str, Any]:
-    """Evaluate a policy; return its results (returns, success, lengths) as the dict that `rlcli eval --json` prints.
+    """Evaluate a policy; return the results (returns, success, lengths) as the dict that `rlcli eval --json` prints.
 
     Args:
-        checkpoint: folder of a run or checkpoint; None takes the newest run of the task, else the policy shipped with
-            the task.
-        task: task to evaluate in; None takes the task of the run.
+        checkpoint: folder of a run or checkpoint; None: the newest run of the task, else the policy that is installed
+            with the task.
+        task: name or folder of the task to evaluate in; None: the task of the run.
         episodes: number of episodes.
-        num_envs: number of environments; None takes the task's own.
+        num_envs: number of environments; None: the number in the task's configuration.
         seed: seed of the episodes.
-        stochastic: sample actions instead of taking the mean.
-        overrides: list of `key.path=value`.
-        runs_dir: folder of the runs.
+        stochastic: whether to sample actions; otherwise the mean of the policy's distribution is the action.
+        overrides: changes of the task's configuration: list of `key.path=value`.
+        runs_dir: folder of the runs; None: the environment variable RLCLI_RUNS_DIR, else `runs`.
 
     Raises:
-        CheckpointError: if there is no such checkpoint.
-        UsageError: if `episodes` is below 1, `seed` is not an integer from 0 to 2^62, or `overrides` is a string.
+        CheckpointError: if there is no such checkpoint, or the checkpoint does not fit the task.
+        UsageError: if neither `checkpoint` nor `task` is given, `episodes` is below 1, `seed` is not an integer from 0
+            to 2^62, or `overrides` is a string.
     """
     _check(seed, overrides)
     if not isinstance(episodes, SupportsIndex) or operator.index(episodes) < 1:
@@ -171,14 +174,15 @@ def load_policy(
 ) -> Callable[[Tensor], Tensor]:
     """Return a trained policy as a function: observations (num_envs, obs_size) -> actions (num_envs, action_size).
 
-    The function keeps the hidden state of a recurrent policy, and resets it where an episode of `env` ends.
+    The observations are those of the group `policy`. The function keeps the hidden state of a recurrent policy, and
+    resets the state of each environment whose episode ends.
 
     Args:
-        env: environment in which the policy acts.
-        checkpoint: folder of a run or checkpoint; None takes the newest run of the task, else the policy shipped with
-            the task.
-        stochastic: sample actions instead of taking the mean.
-        runs_dir: folder of the runs.
+        env: environments in which the policy acts.
+        checkpoint: folder of a run or checkpoint; None: the newest run of the task, else the policy that is installed
+            with the task.
+        stochastic: whether to sample actions; otherwise the mean of the policy's distribution is the action.
+        runs_dir: folder of the runs; None: the environment variable RLCLI_RUNS_DIR, else `runs`.
 
     Raises:
         CheckpointError: if there is no such checkpoint, or the checkpoint does not fit the environment.
@@ -195,9 +199,12 @@ def export(
 
     Args:
         checkpoint: folder of a run or checkpoint.
-        file: path to write; missing folders are created.
+        file: path of the file to write; missing folders are created.
         format: `onnx`, `torch` or `numpy`.
-        runs_dir: folder of the runs.
+        runs_dir: folder of the runs; None: the environment variable RLCLI_RUNS_DIR, else `runs`.
+
+    Returns:
+        The file, and the largest difference between its actions and those of the policy.
 
     Raises:
         UsageError: for an unknown format or a wrong suffix.
@@ -210,7 +217,11 @@ def export(
 
 
 def _check(seed: object, overrides: object) -> None:
-    """Check two arguments that several functions of this module have."""
+    """Check the arguments `seed` and `overrides`, which several functions of this module have.
+
+    Raises:
+        UsageError: if `seed` is not an integer from 0 to 2^62, or `overrides` is a string.
+    """
     if not isinstance(seed, SupportsIndex) or not 0 <= operator.index(seed) <= MAX_SEED:
         raise UsageError(f"seed is {shorten(repr(seed), 40)}; give an integer from 0 to 2^62")
     if isinstance(overrides, str):
@@ -221,12 +232,16 @@ def _check(seed: object, overrides: object) -> None:
 
 
 def _find(checkpoint: Path | str | None, task: TaskSource | None, runs_dir: Path | str | None) -> Path:
-    """Return the folder of a checkpoint; without `checkpoint`, of the newest one of the task."""
+    """Return the folder of a checkpoint or installed policy; without `checkpoint`, of the task's newest run.
+
+    Raises:
+        CheckpointError: if there is no such checkpoint.
+    """
     return choose(None if checkpoint is None else str(checkpoint), Path(runs_dir or default_runs_dir()), task).folder
 
 
 class _ProgressCallback:
-    """Progress view for `run_training` that calls a function of the user after each iteration."""
+    """Display of progress for `run_training` that calls a function of the user after each iteration."""
 
     def __init__(self, function: Callable[[Progress], None] | None) -> None:
         self._function = function

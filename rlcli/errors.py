@@ -1,6 +1,6 @@
-"""Exception classes for errors that the user can fix; the command line ends with the exit code of the class.
+"""Exception classes for errors that the user can fix, and functions for the text of error messages.
 
-Any other exception is a bug and keeps its traceback.
+The command line ends with the exit code of the exception's class. Any other exception is a bug and keeps its traceback.
 """
 
 import difflib
@@ -13,7 +13,7 @@ from pathlib import Path
 from rlcli.safe_text import message_line, shorten
 
 INTERRUPTED, STOPPED = 130, 75
-"""Exit codes after Ctrl-C, and after another signal that stops a run."""
+"""Exit codes after Ctrl-C (`INTERRUPTED`), and after another signal that stops a run (`STOPPED`)."""
 _UNPINNED = ("rlcli[trackio]",)
 """Extras that `pip_install` installs without `constraints.txt`, because of a conflict: trackio needs pillow < 13."""
 
@@ -23,7 +23,7 @@ class RlcliError(Exception):
 
     Args:
         message: what is wrong and where: one line, or a list of lines.
-        hint: what to do.
+        hint: what the user can do; None: no hint.
     """
 
     exit_code = 1
@@ -44,32 +44,31 @@ class UsageError(RlcliError):
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """One mistake in a configuration.
-
-    `where` is `file:line:column` or the text of an override; `path` is the dotted key of the value.
-    """
+    """Mistake in a configuration."""
 
     where: str
+    """Place of the mistake: `file:line:column`, or the text of an override."""
     path: str
+    """Dotted key of the wrong value; empty for a mistake in the file as a whole."""
     message: str
     """What is wrong, and what is allowed."""
     hint: str | None = None
     """What the user can do about the mistake."""
 
     def __post_init__(self) -> None:
-        """Make each part one line of limited length."""
+        """Convert each field to one line of limited length."""
         for name in self.__slots__:
             value = getattr(self, name)
             object.__setattr__(self, name, value and message_line(value))
 
     def __str__(self) -> str:
-        """Return one line: where, key, what is wrong, what to do."""
+        """Return the mistake on one line: place, key, what is wrong, what to do."""
         text = f"{self.where}: {self.path}: {self.message}" if self.path else f"{self.where}: {self.message}"
         return f"{text}; {self.hint}" if self.hint else text
 
 
 class ConfigError(RlcliError):
-    """Error for an invalid configuration. `problems` lists every mistake that was found. Exit code 3."""
+    """Error for an invalid configuration; `problems` has every mistake that was found. Exit code 3."""
 
     exit_code = 3
     kind = "config"
@@ -123,7 +122,7 @@ class DeviceError(RlcliError):
 
 
 class VerdictError(RlcliError):
-    """Negative result of a command that ran to its end: a check failed, or a limit was missed. Exit code 9."""
+    """Negative result of a command that ran to its end: a check failed, or a limit was not met. Exit code 9."""
 
     exit_code = 9
     kind = "verdict"
@@ -137,7 +136,7 @@ class MachineError(RlcliError):
 
 
 class Stopped(RlcliError):
-    """Stop of a run on request; the run can be resumed. Exit code 130 for Ctrl-C, 75 for other requests."""
+    """Stop of a run by a signal; the run can be resumed. Exit code 130 for Ctrl-C, 75 for other signals."""
 
     kind = "stopped"
 
@@ -147,20 +146,21 @@ class Stopped(RlcliError):
 
 
 def did_you_mean(name: str, candidates: Iterable[str]) -> str | None:
-    """Return `did you mean 'x'?` for the most similar candidates (at most three), or None if none is similar."""
+    """Return `did you mean 'x'?` for the candidates (at most three) that are similar to a name; None without such."""
     known = dict.fromkeys(itertools.islice(candidates, 1000))
     close = difflib.get_close_matches(name[:200], known, n=3, cutoff=0.6)
     return f"did you mean {' or '.join(repr(match) for match in close)}?" if close else None
 
 
 def pip_install(package: str) -> str:
-    """Return the command that installs packages, or an extra such as `rlcli[plot]`, in the tested versions.
+    """Return the `pip install` command that installs packages in the tested versions, for a hint.
 
     rlcli and the plugins of its repository are not on a package index. If rlcli runs from a checkout, the command
-    installs them from the checkout's folders, else from a folder with their wheels, which the command calls WHEELS.
+    installs them from the checkout's folders; else from a folder with their wheels, for which the command has the
+    placeholder WHEELS.
 
     Args:
-        package: arguments of `pip install`, separated by spaces.
+        package: names of packages, or of an extra such as `rlcli[plot]`, separated by spaces.
     """
     root = Path(__file__).parents[1]
     # the place of the file in a wheel, and in a checkout
@@ -177,22 +177,22 @@ def pip_install(package: str) -> str:
 
 
 _MAX_ERROR_TEXT = 20_000
-"""Largest part of an error's message that is read [characters]: more would take too long to split and escape."""
+"""Largest part of an error's message that is used [characters]; longer text would take too long to split and escape."""
 
 
 def error_text(error: BaseException) -> str:
     """Return the message of an error, cut to `_MAX_ERROR_TEXT` characters.
 
-    If the error's `__str__` itself raises, as in a broken class of a task, return a text that says so.
+    If the error's `__str__` itself raises an exception, return a text that says so.
     """
     try:
         return str(error)[:_MAX_ERROR_TEXT]
     except BaseException as failed:
-        return f"its message cannot be read: __str__ raises {type(failed).__name__}"
+        return f"the error's message cannot be read: __str__ raises {type(failed).__name__}"
 
 
 def error_with_type(error: BaseException) -> str:
-    """Return the message of an error; if the error is not one of rlcli, with its class name in front."""
+    """Return the message of an error; if the error is no `RlcliError`, with the name of its class in front."""
     if isinstance(error, RlcliError):
         return error.message
     return ": ".join(filter(None, (type(error).__name__, error_text(error))))
@@ -204,10 +204,10 @@ def short_error(error: BaseException) -> str:
 
 
 def one_line(error: BaseException, limit: int | None = None) -> str:
-    """Return the message of an error on one line, cut to `limit` characters; its class name if it has no message."""
+    """Return the message of an error on one line, cut to `limit` characters; without message, the name of its class."""
     text = " ".join(error_text(error).split())
     if "set_int_max_str_digits" in text:  # Python's advice does not help users of rlcli
-        text = "it has a number of more than 4300 digits"
+        text = "a number has more than 4300 digits"
     return text[:limit] or type(error).__name__
 
 
@@ -217,7 +217,7 @@ def require_known(name: str, names: Sequence[str], what: str, plural: str) -> No
     Args:
         name: the name that the user typed.
         names: the valid names.
-        what: the kind of thing that has the name, for the message, such as `policy`.
+        what: noun for the message that says what the name stands for, such as `policy`.
         plural: the plural of `what`, for the hint.
 
     Raises:
@@ -228,14 +228,14 @@ def require_known(name: str, names: Sequence[str], what: str, plural: str) -> No
 
 
 def listing(names: Iterable[str], limit: int = 20) -> str:
-    """Return names as text for a message, separated by commas and cut after `limit` names."""
+    """Return names as text for a message, separated by commas and cut after `limit` names; without names, `(none)`."""
     names = list(names)
     shown = ", ".join(names[:limit])
     return f"{shown}, ... ({len(names)} in all)" if len(names) > limit else shown or "(none)"
 
 
 def _position(problem: Problem) -> tuple[str, tuple[int, ...], str]:
-    """Return the sort key of a problem: file, line and column as numbers, dotted key."""
+    """Return the sort key of a problem: its file (or override), its line and column as numbers, its dotted key."""
     file, *numbers = problem.where.rsplit(":", 2)
     place = tuple(int(number) for number in numbers if number.isdecimal() and len(number) < 10)
     return (file if len(place) == 2 else problem.where, place, problem.path)

@@ -1,8 +1,8 @@
 """Registration of every installed task with Gymnasium as `rlcli/NAME`, done when this module is imported.
 
-`gym.make_vec("rlcli.gym:rlcli/cartpole", num_envs=8)` imports this module by itself. The code of a task is imported
-when its environment is made. If two plugins offer the same name, the ids are `rlcli/DISTRIBUTION.NAME`. The id
-`rlcli/task` makes a task that is not installed: its argument `task` is the folder of the task.
+`gym.make_vec("rlcli.gym:rlcli/cartpole", num_envs=8)` imports this module automatically. The code of a task is imported
+when its environment is made. If several installed packages have a task of the same name, the ids are
+`rlcli/DISTRIBUTION.NAME`. The id `rlcli/task` is for a task that is not installed: its argument `task` is the folder.
 """
 
 from collections import Counter
@@ -15,7 +15,7 @@ _ADAPTER = "rlcli.adapters.gymnasium"
 
 
 def register_all() -> list[str]:
-    """Register all installed tasks with Gymnasium and return their ids."""
+    """Register all installed tasks, and the id `rlcli/task`, with Gymnasium; return all ids."""
     entries, _ = catalog()
     shared = Counter(entry.name for entry in entries)
     tasks: dict[str, dict[str, str]] = {"task": {}}
@@ -38,3 +38,4 @@ def register_all() -> list[str]:
 
 
 IDS = register_all()
+"""Ids of all registered environments."""

@@ -1,4 +1,4 @@
-"""Pytest fixture `rlcli_check`, with which authors of tasks test them. Pytest finds it when rlcli is installed.
+"""Pytest fixture `rlcli_check`, which runs `rlcli check` on a task in a test. Pytest finds the fixture by itself.
 
 ```python
 def test_the_contract(rlcli_check):
@@ -22,10 +22,8 @@ if TYPE_CHECKING:
 def rlcli_check() -> Callable[..., list[Finding]]:
     """Return a function that runs the checks of `rlcli check` on a task.
 
-    The function fails the test if a check finds errors, and returns the warnings.
-
     The function has the arguments of `rlcli.testing.check_task`: the name or folder of a task, `agent`, `overrides`
-    and `only`.
+    and `only`. If a check finds errors, the test fails; otherwise the function returns the warnings.
     """
 
     def check(

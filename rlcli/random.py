@@ -1,7 +1,8 @@
-"""Counter-based random numbers: each number depends on (seed, stream, environment, counter, index) and nothing else.
+"""Counter-based random numbers: each number depends only on (seed, stream, environment, counter, index).
 
-Environment 7 therefore draws the same numbers for any number of environments and threads, and for any order in which
-other environments reset or sample. The mixing function is the finaliser of SplitMix64 (Steele, Lea and Flood 2014,
+So an environment draws the same numbers for any number of environments and threads, and for any order in which other
+environments reset or sample. A stream is a sequence of random numbers for one purpose, such as a term; the counter is
+the number of an episode or step. The mixing function is the finaliser of SplitMix64 (Steele, Lea and Flood 2014,
 https://doi.org/10.1145/2660193.2660195).
 """
 
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Keys = NDArray[np.uint64]
-"""Keys of random streams, one 64-bit number for each stream."""
+"""Keys: 64-bit numbers from which random numbers are computed, one for each (seed, environment, counter)."""
 
 # 0-d arrays instead of scalars: numpy converts each scalar operand to an array, which takes as long as the operation
 _GOLDEN = np.array(0x9E3779B97F4A7C15, np.uint64)
@@ -21,14 +22,14 @@ _MIX2 = np.array(0x94D049BB133111EB, np.uint64)
 _S30, _S27, _S31, _S40 = (np.array(shift, np.uint64) for shift in (30, 27, 31, 40))
 _TO_UNIT = np.array(2.0**-24, np.float32)
 _NARROW = 8
-"""Number of random words per key up to which numpy adds faster along the keys than along the words."""
+"""Number of words per key up to which numpy is faster if its inner loop runs over the keys instead of the words."""
 _BLOCK = 1 << 14
 """Number of 64-bit values that are hashed at once, so that their copies stay in the cache of a core."""
 
 
 @functools.lru_cache(maxsize=4096)
 def stream(name: str) -> np.uint64:
-    """Return the number of a random stream, such as that of a term: 64 bits of the BLAKE2b hash of its name."""
+    """Return the number of the random stream with a name (such as a term's name): 64 bits of its BLAKE2b hash."""
     return np.uint64(int.from_bytes(hashlib.blake2b(name.encode(), digest_size=8).digest(), "little"))
 
 
@@ -46,9 +47,12 @@ def mix(x: Keys) -> Keys:
 
 
 def row_keys(seed: int, env_ids: NDArray[np.int64], counters: NDArray[np.int64]) -> Keys:
-    """Return a key for each pair of an environment and a counter (episode or step number). (n,)
+    """Return a key for each pair of an environment and a counter, from which its random numbers are computed. (n,)
 
-    All random numbers of the pair are computed from its key.
+    Args:
+        seed: the seed.
+        env_ids: indices of environments. (n,)
+        counters: number of the episode or step of each of these environments. (n,)
     """
     keys = mix(env_ids.astype(np.uint64) * _GOLDEN + start(seed))
     keys += counters.astype(np.uint64) * _GOLDEN
@@ -71,7 +75,7 @@ def bits(keys: Keys, stream: np.uint64, index: int, count: int) -> Keys:
 
 
 def uniform(keys: Keys, stream: np.uint64, index: int, count: int) -> NDArray[np.float32]:
-    """Return uniform random numbers in [0, 1), multiples of 2**-24; the arguments are as in `bits`. (n, count)"""
+    """Return uniform random numbers in [0, 1), multiples of 2**-24; for the arguments see `bits`. (n, count)"""
     rows = max(1, _BLOCK // max(1, count))
     if len(keys) <= rows:
         return _to_unit(bits(keys, stream, index, count))
@@ -82,7 +86,7 @@ def uniform(keys: Keys, stream: np.uint64, index: int, count: int) -> NDArray[np
 
 
 def _to_unit(words: Keys) -> NDArray[np.float32]:
-    """Return random words as numbers in [0, 1). The words are overwritten."""
+    """Convert random 64-bit words to numbers in [0, 1), of the same shape. The words are overwritten."""
     words >>= _S40  # 24 bits remain, as many as the significand of a float32 holds exactly
     unit = words.view(np.int64).astype(np.float32, order="C")  # numpy converts signed words faster
     unit *= _TO_UNIT
@@ -90,9 +94,9 @@ def _to_unit(words: Keys) -> NDArray[np.float32]:
 
 
 def normal(keys: Keys, stream: np.uint64, index: int, count: int) -> NDArray[np.float32]:
-    """Return standard normal random numbers, each from two uniform ones (Box-Muller). (n, count)
+    """Return standard normal random numbers, each from two uniform numbers (Box-Muller). (n, count)
 
-    The arguments are as in `bits`.
+    For the arguments see `bits`.
     """
     u = uniform(keys, stream, index, 2 * count)
     # log1p(-u) with u in [0, 1) is finite; log(u) would be -inf at u = 0
@@ -102,14 +106,16 @@ def normal(keys: Keys, stream: np.uint64, index: int, count: int) -> NDArray[np.
 
 
 def integers(keys: Keys, stream: np.uint64, index: int, count: int, high: int) -> NDArray[np.int64]:
-    """Return uniform random integers from 0 to `high` - 1; the other arguments are as in `bits`. (n, count)"""
+    """Return uniform random integers from 0 to `high` - 1; for the other arguments see `bits`. (n, count)"""
     return (uniform(keys, stream, index, count).astype(np.float64) * high).astype(np.int64)
 
 
 def derive(seed: int, name: str) -> int:
-    """Return a 31-bit seed for a further random generator, such as torch's, from a seed and the generator's purpose.
+    """Return a 31-bit seed for another random generator, such as torch's.
 
-    `name` is the purpose. Seeds for different purposes are independent.
+    Args:
+        seed: the seed of the training or evaluation.
+        name: purpose of the generator; seeds for different purposes are independent.
     """
     return int(mix(_word(seed) ^ stream(name))[0] >> np.uint64(33))
 
@@ -122,8 +128,10 @@ def start(seed: int) -> Keys:
 
 @functools.lru_cache(maxsize=4096)
 def _offsets(stream: int, index: int, count: int) -> Keys:
+    """Return the numbers that are added to a key before mixing, one for each index of the stream. (count,)"""
     return np.arange(index + 1, index + count + 1, dtype=np.uint64) * _GOLDEN + np.uint64(stream)
 
 
 def _word(seed: int) -> Keys:
+    """Return the lowest 64 bits of a seed. (1,)"""
     return np.array([seed & 0xFFFFFFFFFFFFFFFF], np.uint64)

@@ -1,7 +1,7 @@
-"""Helpers for text from files and command lines: numbers, unsafe characters, and short messages about long inputs.
+"""Functions for text from files and command lines: parse numbers, escape unsafe characters, keep messages short.
 
-A message that repeats a long input would hide what is wrong. Long inputs are remembered, and `message_line` shortens
-them in messages.
+A message that repeats a long input would hide what is wrong. Therefore long inputs are remembered, and `message_line`
+shortens copies of the inputs in messages.
 """
 
 import math
@@ -18,7 +18,7 @@ MAX_SEED = 2**62
 
 
 def shorten(value: object, limit: int, mark: str = "...") -> str:
-    """Return a value as text of at most `limit` characters; `mark` replaces the part that is cut off."""
+    """Return a value as text of at most `limit` characters; if text is cut off at the end, `mark` is put there."""
     text = str(value)
     return text if len(text) <= limit else text[: limit - len(mark)] + mark
 
@@ -30,7 +30,7 @@ _MAX_ECHO, _MAX_LINE = 200, 2000
 _inputs: deque[str] = deque(maxlen=1000)
 """Inputs (words of the command line, texts of files) whose printed form is longer than `_MAX_ECHO`."""
 _input_pieces: set[int] = set()
-"""Hashes of all parts of `_inputs` with `_MAX_ECHO` + 1 characters; empty until a long message needs them."""
+"""Hashes of all substrings of `_inputs` with `_MAX_ECHO` + 1 characters; computed at the first long message."""
 
 
 def remember_given(words: Iterable[str]) -> None:
@@ -56,9 +56,10 @@ def remember_input(texts: Iterable[str]) -> None:
 
 
 def message_line(text: str) -> str:
-    """Return the text of a message on one line.
+    """Return the text of a message on one line of at most 2000 characters.
 
-    Characters that are not printable are escaped. Words, quotes and parts of inputs of over 200 characters are cut.
+    Characters that are not printable are escaped. Words, quoted texts and copies of inputs of over 200 characters are
+    shortened.
     """
     line = _without_echoes(printable(text[: 10 * _MAX_LINE]))
     return _cut(_LONG.sub(lambda found: _cut(found[0], _MAX_ECHO), line), _MAX_LINE)
@@ -85,7 +86,7 @@ def _without_echoes(line: str) -> str:
 
 
 def printable(text: str) -> str:
-    """Return a text with escapes in place of the characters that are not printable."""
+    """Return a text with an escape sequence in place of each character that is not printable."""
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
@@ -99,10 +100,10 @@ _FLOAT = re.compile(r"(?![-+]?0[0-9]+\Z)[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-
 
 
 def read_number(text: str) -> int | float | None:
-    """Return the number that a text spells; None for any other text.
+    """Return the number that a text in a file or on the command line stands for; None for any other text.
 
-    Files and command lines have the same numbers: decimal digits without `_` and spaces, no octal numbers such as
-    `010`, no words such as `inf`.
+    A number has decimal digits without `_` and spaces. Octal numbers such as `010` and words such as `inf` are no
+    numbers.
     """
     if _INT.match(text):
         return int(text)
@@ -110,6 +111,6 @@ def read_number(text: str) -> int | float | None:
 
 
 def float_or_nan(text: str) -> float:
-    """Return the number that a text spells, ignoring spaces around it; NaN for any other text."""
+    """Return the number that a text stands for (see `read_number`), without spaces around it; NaN for other text."""
     number = read_number(text.strip())
     return math.nan if number is None else float(number)

@@ -1,7 +1,8 @@
 """Generator of the files that `rlcli new` writes: a Python package with a new task.
 
-The templates are in `rlcli/templates`: the folder `common`, and one folder for each flavour. In their paths `package`
-stands for the name of the Python package, and `suite` for `tests` (some wheel builders exclude folders named `tests`).
+The templates are in `rlcli/templates`: the folder `common`, and a folder for each flavour (kind of task). In the paths
+of templates, `package` stands for the name of the Python package, and `suite` for `tests`, because some wheel builders
+exclude folders named `tests`.
 """
 
 from __future__ import annotations
@@ -27,7 +28,9 @@ if TYPE_CHECKING:
     from rlcli.scaffold_robot import RobotTask
 
 FLAVOURS = ("yaml", "direct")
+"""Kinds of tasks: manager-based, in YAML; or a direct task, as a Python class."""
 MAX_LENGTH = 64
+"""Largest length of a task's name [characters]."""
 _TEMPLATES = Path(__file__).parent / "templates"
 _DEVICES = {"con", "prn", "aux", "nul", *(f"{port}{n}" for port in ("com", "lpt") for n in range(10))}
 """File names that Windows reserves for devices."""
@@ -36,20 +39,20 @@ _DEVICES = {"con", "prn", "aux", "nul", *(f"{port}{n}" for port in ("com", "lpt"
 def create(
     name: str, flavour: str, folder: Path | None = None, robot: RobotTask | None = None
 ) -> tuple[Path, list[str]]:
-    """Write the package of a new task, completely or not at all.
+    """Write the package of a new task; if an error occurs, write nothing.
 
     Args:
         name: name of the task.
-        flavour: the template: `yaml` (manager-based task) or `direct`; not used with `robot`.
+        flavour: kind of the task: `yaml` (manager-based task) or `direct`; ignored with `robot`.
         folder: folder of the package; None: a folder with the task's name.
-        robot: model and YAML of a task for a robot of the user (`rlcli new --robot`).
+        robot: model and YAML of a task for a robot of the user (`rlcli new --robot`); None: a task with a sample robot.
 
     Returns:
         The folder of the package, and its files relative to that folder.
 
     Raises:
-        UsageError: if the name is not valid for a task, a distribution and a Python package, or if the folder is not
-            empty.
+        UsageError: for an unknown flavour; if the name is not valid for a task, a distribution and a Python package; or
+            if the folder is not empty.
         MachineError: if the files cannot be written.
     """
     if robot is None:
@@ -76,7 +79,7 @@ def create(
 
 
 def check_name(name: str) -> None:
-    """Check that a task, a distribution and a Python package can have this name.
+    """Check that a new task, its distribution and its Python package can have a name.
 
     Raises:
         UsageError: if the name is not valid or already in use.
@@ -94,7 +97,7 @@ def check_name(name: str) -> None:
         (name in _DEVICES, "the name of a device on Windows"),
     ):
         if reserved:
-            raise UsageError(f"'{name}' cannot be a package: it is {reason}", hint=f"use {name}-task, for example")
+            raise UsageError(f"'{name}' cannot name a package: it is {reason}", hint=f"use {name}-task, for example")
     owners = [f"{entry.distribution} {entry.version}" for entry in catalog(TASKS, hidden=True)[0] if entry.name == name]
     distribution, module = _installed_version(name), _module_file(package)
     if owners:
@@ -109,7 +112,14 @@ def check_name(name: str) -> None:
 
 
 def render(name: str, flavour: str, summary: str = "", *, has_pose: bool = True) -> dict[str, str]:
-    """Return the texts of all files of a new package, by path within the package's folder, from the templates."""
+    """Return the texts of all files of a new package: path within the package's folder -> text.
+
+    Args:
+        name: name of the task.
+        flavour: folder of templates, such as `yaml`.
+        summary: one line that describes the task.
+        has_pose: whether the robot's MJCF has a default pose.
+    """
     import jinja2
 
     package = name.replace("-", "_")
@@ -129,15 +139,18 @@ def render(name: str, flavour: str, summary: str = "", *, has_pose: bool = True)
 
 
 _SCHEMA = "task.schema.json"
+"""Name of the file with the JSON Schema of the task, for editors."""
 
 
 def _write(folder: Path, files: dict[str, str], package: str, assets: Mapping[str, Path]) -> None:
-    """Write all files to a temporary folder beside the target folder, and move them when they are complete.
+    """Write all files of a new package, and the JSON Schema of its task.
+
+    The files are written to a temporary folder beside the target folder, and moved when all of them are complete.
 
     Args:
         folder: the target folder.
         files: path within the folder -> text.
-        package: name of the Python package; the JSON Schema of its task is written as well.
+        package: name of the Python package.
         assets: path within the folder -> file to copy, such as a mesh.
     """
     from rlcli.config.dump import json_schema
@@ -174,6 +187,11 @@ def _write(folder: Path, files: dict[str, str], package: str, assets: Mapping[st
 
 
 def _check_folder(folder: Path) -> None:
+    """Check that a folder does not exist or is empty.
+
+    Raises:
+        UsageError: if not.
+    """
     if os.path.lexists(folder) and not folder.is_dir():
         raise UsageError(f"'{folder}' exists and is not a folder", hint="give another --output FOLDER")
     if folder.is_dir() and any(folder.iterdir()):
@@ -182,14 +200,14 @@ def _check_folder(folder: Path) -> None:
 
 
 def _suggest_name(name: str) -> str | None:
-    """Return the hint for an invalid task name: a valid name that is similar to it."""
+    """Return the hint for an invalid task name: a similar valid name, or an example."""
     words = re.sub(r"([a-z0-9])([A-Z])", r"\1-\2", name)
     near = re.sub(r"[^a-z0-9]+", "-", words.lower()).strip("-").lstrip("0123456789-")
     return f"did you mean '{near}'?" if near and near != name and name.isascii() else "use my-arm, for example"
 
 
 def _installed_version(name: str) -> str | None:
-    """Return name and version of the installed distribution of this name; None if there is none."""
+    """Return name and version of the installed distribution with a name; None if it is not installed."""
     try:
         return f"{name} {metadata.version(name)}"
     except metadata.PackageNotFoundError:
@@ -199,7 +217,7 @@ def _installed_version(name: str) -> str | None:
 
 
 def _module_file(package: str) -> str | None:
-    """Return the file of an installed module; None if there is none."""
+    """Return the file of an installed Python module or package; None if there is no such module."""
     try:
         found = importlib.util.find_spec(package)
     except (ImportError, ValueError):

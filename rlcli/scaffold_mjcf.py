@@ -1,4 +1,8 @@
-"""Analysis of a robot's MJCF for `rlcli new --robot FILE.xml`: joints, efforts, default pose, height, asset files."""
+"""Analysis of a robot's MJCF for `rlcli new --robot FILE.xml`: joints, efforts, default pose, height, asset files.
+
+The class `Robot` also returns the settings of a new task that follow from the analysis. A kind of task is `velocity`,
+`reach` or `balance`, see `rlcli.scaffold_robot`.
+"""
 
 from __future__ import annotations
 
@@ -27,9 +31,9 @@ from rlcli.scene.reachable_positions import coupled_joints, follow_coupled_joint
 _CONTROL_DT = 0.02
 """Control period of the new task [s]."""
 _USUAL_DT, _REACH_DT = 0.002, 0.005
-"""Time step that MuJoCo takes for a file without one, and the time step of a reaching task for it [s]."""
+"""MuJoCo's default time step, and the time step with which a reaching task replaces the default [s]."""
 _MAX_DECIMATION = 20
-"""Largest number of physics steps in a control period. A small robot with a short time step moves faster."""
+"""Largest number of physics steps in a control period; see `Robot.tempo` for robots with a very short time step."""
 _VIEW = np.array([4.0, 4.0, 3.0])
 """Direction from the robot to the camera, world frame. (x, y, z)"""
 _ROOT = 1
@@ -37,7 +41,15 @@ _ROOT = 1
 
 
 class Robot:
-    """Robot of an MJCF, compiled: its joints, their actuators, its default pose, and its height above the ground."""
+    """Robot of an MJCF, compiled: its joints, their actuators, its default pose, and its height above the ground.
+
+    Args:
+        spec: the robot's MJCF; the elements that a task defines itself are removed from it.
+        file: file of the MJCF.
+
+    Raises:
+        ValueError: if the MJCF has ball joints or cannot be compiled, or an asset file is missing.
+    """
 
     def __init__(self, spec: mujoco.MjSpec, file: Path) -> None:
         self.spec, self.file = spec, file
@@ -60,13 +72,13 @@ class Robot:
         self.dt = model.opt.timestep if model.opt.timestep <= 0.01 else 0.005
         self.decimation = min(max(1, round(_CONTROL_DT / self.dt)), _MAX_DECIMATION)
         self.tempo = round3(min(1.0, _MAX_DECIMATION * self.dt / _CONTROL_DT))
-        """Factor of all durations of the task, such as the episode length; below 1 if the decimation would exceed
-        `_MAX_DECIMATION`."""
+        """Factor of all durations of the task, such as the episode length. The factor is below 1 for a small, fast
+        robot: one whose time step is so short that the decimation would exceed `_MAX_DECIMATION`."""
         self.gravity = float(np.linalg.norm(model.opt.gravity))
         """Magnitude of gravity in the MJCF, in the unit of length of the file per s^2."""
         balls = [model.joint(j).name for j in range(model.njnt) if model.jnt_type[j] == int(mujoco.mjtJoint.mjJNT_BALL)]
         if balls:
-            raise ValueError(f"ball joints are not supported: {listing(balls)}; use three hinges")
+            raise ValueError(f"ball joints are not supported: {listing(balls)}; use three hinges for each")
         self.free = bool(model.njnt and model.body_jntnum[_ROOT] and model.jnt_type[0] == FREE)
         """Whether the base of the robot floats."""
         self.joints = [j for j in range(model.njnt) if model.jnt_type[j] in SCALAR]
@@ -74,7 +86,7 @@ class Robot:
         self.actuator = {int(model.actuator_trnid[a, 0]): a for a in range(model.nu) if joint_actuator[a]}
         names = [self.name(j) for j in self.joints]
         self.doubts = [(message, hint) for message, hint, _ in doubtful_limits(model, self.joints, names)]
-        """Message and hint for each property of the file that is probably an error."""
+        """(message, hint) for each property of the file that is probably an error."""
         self.data = mujoco.MjData(model)
         for joint in self.joints:
             if home is not None and len(home) == model.nq:
@@ -89,7 +101,7 @@ class Robot:
                 address = model.jnt_qposadr[joint]
                 self.data.qpos[address] = np.clip(self.data.qpos[address], *model.jnt_range[joint])
         self.height = self._lower_to_ground() if self.free else 0.0
-        """Height of the root above the ground in the default pose [m]."""
+        """Height of a floating root above the ground in the default pose; 0 for a fixed root [m]."""
         locked = {j for j in self.joints if j not in self.actuator and self._is_locked(j)}
         for pair in coupled_joints(model):  # coupled joints, such as two fingers: only one of the two is driven
             locked.add(next((j for j in pair[:2] if j not in self.actuator), -1))
@@ -101,13 +113,14 @@ class Robot:
         self.passive = [j for j in self.joints if j in own and j not in locked.union(self.driven)]
         mujoco.mj_forward(model, self.data)
         self.com_height = float(self.data.subtree_com[_ROOT, 2]) if self.free else 0.0
-        """Height of a floating robot's centre of mass above the ground in the default pose [m]."""
+        """Height of a floating robot's centre of mass above the ground in the default pose; 0 for a fixed root [m]."""
         self.inertia = self._inertia(self.data)
 
     def fitting_kind(self) -> tuple[str, str]:
-        """Return the kind of task that fits the robot, velocity, reach or balance, and the reason.
+        """Return the kind of task that fits the robot, and the reason.
 
-        velocity: follow velocity commands; reach: move the last body to a goal; balance: keep the default pose.
+        The kinds are `velocity` (follow velocity commands), `reach` (move the last body to a goal) and `balance` (keep
+        the default pose).
         """
         driven, undriven = len(self.driven), [self.name(j) for j in self.passive]
         joints = _count(driven, "driven joint")
@@ -117,46 +130,47 @@ class Robot:
             if obstacle := self.obstacle_to("velocity"):
                 return "balance", obstacle
             if driven < 4:
-                return "balance", f"its base floats, but it has only {joints}, and walking needs 4"
+                return "balance", f"the robot's base floats, but it has only {joints}, and walking needs 4"
             if driven <= len(undriven):
-                return "balance", f"its base floats, but {without}, and only {driven} have one"
-            return "velocity", f"its base floats, it has {_count(len(self.feet()), 'foot', 'feet')} and {joints}"
+                return "balance", f"the robot's base floats, but {without}, and only {driven} have an actuator"
+            feet = _count(len(self.feet()), "foot", "feet")
+            return "velocity", f"the robot's base floats, and it has {feet} and {joints}"
         if undriven:
-            return "balance", f"its base is fixed, but {without}"
+            return "balance", f"the robot's base is fixed, but {without}"
         if driven < 2:
-            return "balance", "its base is fixed, and it has only one driven joint; reaching needs 2"
+            return "balance", "the robot's base is fixed, and only one joint is driven, but reaching needs 2"
         if obstacle := self.obstacle_to("reach"):
             return "balance", obstacle
-        return "reach", f"its base is fixed, and all of its {driven} joints are driven"
+        return "reach", f"the robot's base is fixed, and all {driven} joints are driven"
 
     def obstacle_to(self, kind: str) -> str:
-        """Return why a kind of task is impossible for the robot; empty if it is possible."""
+        """Return why a kind of task (`velocity`, `reach`, `balance`) is impossible for the robot; empty if possible."""
         if kind == "velocity":
             if not self.free:
-                return "its base is fixed"
+                return "the robot's base is fixed"
             if not self.gravity:
-                return "there is no gravity, so it cannot walk"
-            return "" if self.feet() else "no body besides the root touches the ground, so it has no feet"
+                return "the file sets gravity to 0, so the robot cannot walk"
+            return "" if self.feet() else "no body besides the root touches the ground, so the robot has no feet"
         if kind == "reach":
             if self.free:
-                return "its base floats"
+                return "the robot's base floats"
             hand = self.body_name(self.last_body())
             moves = np.ptp(self.workspace(), axis=0).max() > 0.01
-            return "" if moves else f"its joints do not move its last body '{hand}' by more than 1 cm"
+            return "" if moves else f"the joints do not move the last body '{hand}' by more than 1 cm"
         return ""
 
     def name(self, joint: int) -> str:
-        """Return the name of the joint with this id."""
+        """Return the name of the joint with the id `joint` in the compiled model."""
         return str(self.model.joint(joint).name)
 
     def body_name(self, body: int) -> str:
-        """Return the name of the body with this id."""
+        """Return the name of the body with the id `body` in the compiled model."""
         return str(self.model.body(body).name)
 
     def is_wheel(self, joint: int) -> bool:
-        """Return whether a joint turns a wheel or flywheel: a hinge without limits, with its load balanced on its axis.
+        """Return whether a joint turns a wheel or flywheel: a hinge without limits that carries balanced bodies.
 
-        The centre of mass of what the hinge moves is nearer to the axis than a tenth of the radius of gyration.
+        Bodies are balanced if their centre of mass is nearer to the axis than a tenth of their radius of gyration.
         """
         model, data = self.model, self.data
         if model.jnt_type[joint] != SCALAR[0] or model.jnt_limited[joint]:
@@ -168,8 +182,9 @@ class Robot:
     def max_effort(self, joint: int) -> float:
         """Return the largest effort of a joint [N or N m]: the limit in the file, else an estimate from carried weight.
 
-        A slide holds twice the weight of the bodies that it carries; a hinge holds this weight at a distance of 0.6 m.
-        In a robot with a floating base every joint carries the whole robot, a hinge at half the height of the root.
+        The estimate for a slide is twice the weight of the bodies that the joint carries; for a hinge, their weight at
+        a lever arm of 0.6 m. In a robot with a floating base, every joint carries the whole robot, and the lever arm of
+        a hinge is half the height of the root.
         """
         model, a = self.model, self.actuator.get(joint)
         if model.jnt_actfrclimited[joint]:
@@ -186,19 +201,19 @@ class Robot:
         return max(0.05, weight * (2.0 if model.jnt_type[joint] == SCALAR[1] else lever))
 
     def _is_locked(self, joint: int) -> bool:
-        """Return whether friction and damping stop a joint; some files lock joints with a damping of 1e11 for example.
+        """Return whether friction and damping hold a joint in place; some files lock joints with a damping of 1e11.
 
-        The largest effort of such a joint moves it at less than 1 cm/s or 0.01 rad/s.
+        At its largest effort, such a joint moves at less than 1 cm/s or 0.01 rad/s.
         """
         dof = self.model.jnt_dofadr[joint]
         resistance = 0.01 * self.model.dof_damping[dof] + self.model.dof_frictionloss[dof]
         return bool(resistance > abs(self.max_effort(joint)))
 
     def joint_settings(self, kind: str) -> dict[str, dict[str, float]]:
-        """Return kp, kv and effort_limit, by joint name, for the joints without a position actuator in the file.
+        """Return {kp, kv, effort_limit} by joint name, for the driven joints without a position actuator in the file.
 
-        The joints of a walking robot are compliant. Those of an arm follow their targets with a lag of 0.1 s, so stiff
-        that gravity displaces the last body by a small part of its workspace.
+        In a velocity task the joints are compliant: the largest effort is reached at an error of 0.1 m or 1 rad. In a
+        reaching task the joints are stiff, see `_stiff_gains`.
         """
         settings = {}
         stiff = self._stiff_gains() if kind == "reach" else {}
@@ -209,7 +224,6 @@ class Robot:
             if joint in stiff:
                 kp, kv = stiff[joint]
             else:
-                # the largest effort is reached at an error of 0.1 m or 1 rad
                 kp = effort * (10.0 if self.model.jnt_type[joint] == SCALAR[1] else 1.0)
                 kv = 2.0 * 0.5 * math.sqrt(kp * self.inertia[joint])  # damping ratio 0.5
             settings[self.name(joint)] = {"kp": round3(kp), "kv": round3(kv), "effort_limit": round3(effort)}
@@ -220,9 +234,11 @@ class Robot:
         return joint in self.actuator and bool(self.model.actuator_biasprm[self.actuator[joint], 1] < 0.0)
 
     def _stiff_gains(self) -> dict[int, tuple[float, float]]:
-        """Return the gains (kp, kv) of stiff, overdamped servos, by joint id.
+        """Return the gains (kp, kv) of stiff, overdamped position servos, by joint id.
 
-        Gravity turns a point mass at the distance r by g / (r w^2), so w^2 = g / d gives a displacement of d at any r.
+        The servos follow their targets with a lag of 0.1 s. Gravity displaces the last body by about 0.5 % of the size
+        of its workspace: it turns a point mass at the distance r by g / (r w^2), where w is the servo's natural
+        frequency, so w^2 = g / d gives the displacement d at any r.
         """
         sag = 0.005 * float(np.ptp(self.workspace(), axis=0).max())
         frequency = min(max(math.sqrt((self.gravity or 9.81) / sag), 20.0 / self.tempo), 0.3 / self.dt)
@@ -241,13 +257,13 @@ class Robot:
         return gains
 
     def sim_settings(self) -> dict[str, Any]:
-        """Return the physics settings of the task as data of its YAML."""
+        """Return the section `sim` (physics settings) of a task for the robot, as data of its YAML."""
         settings: dict[str, Any] = {"dt": self.dt, "integrator": "implicitfast"}  # stable with the damping of servos
         gravity = [float(value) for value in self.model.opt.gravity]
         return settings if gravity == [0.0, 0.0, -9.81] else settings | {"gravity": gravity}
 
     def scene_settings(self, kind: str) -> dict[str, Any]:
-        """Return the key `scene` of a task of this kind for the robot, as data for its YAML."""
+        """Return the section `scene` of a task of a kind (`velocity`, `reach`, `balance`), as data of its YAML."""
         robot: dict[str, Any] = {"model": "model.xml"}
         if self.free:
             robot["pos"] = [0.0, 0.0, round(self.height + 0.0005, 4)]  # 0.5 mm: touching, but never inside the ground
@@ -260,7 +276,7 @@ class Robot:
         return {"num_envs": envs, "env_spacing": 2.5, "entities": {"robot": robot}}
 
     def viewer_settings(self, kind: str) -> dict[str, Any]:
-        """Return the camera of a task of this kind, which sees the whole robot in its default pose."""
+        """Return the section `viewer` of a task of a kind: a camera that sees the whole robot in its default pose."""
         model, data = self.model, self.data
         solid = [g for g in range(model.ngeom) if model.geom_bodyid[g]]
         points, radii = np.vstack([data.xpos[1:], data.geom_xpos[solid]]), np.zeros((model.nbody - 1 + len(solid), 1))
@@ -272,11 +288,14 @@ class Robot:
         return place | ({"follow": "robot"} if kind == "velocity" else {})
 
     def feet(self) -> list[str]:
-        """Return the names of the bodies, without the root, that touch the ground in the default pose within 1 cm."""
+        """Return the names of the bodies that are at most 1 cm above the ground in the default pose, without the root.
+
+        Bodies that are fixed to the root count as the root.
+        """
         return [self.body_name(b) for b in self._touching(-0.01) if self.model.body_weldid[b] != _ROOT]
 
     def trunk(self) -> list[str]:
-        """Return the names of the bodies with geoms among the root and the bodies that are fixed to the root."""
+        """Return the names of the bodies with geoms that are the root or fixed to the root."""
         return [self.body_name(b) for b in dict.fromkeys(self.model.geom_bodyid) if self.model.body_weldid[b] == _ROOT]
 
     def _lower_to_ground(self) -> float:
@@ -289,9 +308,11 @@ class Robot:
         return high
 
     def _touching(self, height: float, *, absolute: bool = False) -> list[int]:
-        """Return the ids of the bodies with a colliding geom below z = 0 if the root is moved.
+        """Return the ids of the robot's bodies with a colliding geom below z = 0, after the root is moved vertically.
 
-        The z coordinate of the root is `height` [m] above its present value; with `absolute`, it is `height`.
+        Args:
+            height: change of the root's z coordinate from the default pose [m].
+            absolute: whether `height` is the z coordinate itself instead of its change.
         """
         model, data = self.model, mujoco.MjData(self.model)
         data.qpos[:] = self.data.qpos
@@ -311,10 +332,10 @@ class Robot:
         return {j: float(matrix[self.model.jnt_dofadr[j], self.model.jnt_dofadr[j]]) for j in self.joints}
 
     def prepare_for_reaching(self) -> None:
-        """Choose the default pose and the physics step of a reaching task.
+        """Choose the default pose and the physics step of a reaching task, in place.
 
-        Without a default pose in the file, a joint that cannot turn far from zero in both directions starts in the
-        middle of its range. The step of MuJoCo's default is long enough for contacts; reaching needs fewer steps.
+        Without a default pose in the file, a joint starts in the middle of its range if 0 is far from the middle. If
+        the file has MuJoCo's default time step, which is short because of contacts, reaching uses a longer time step.
         """
         model, ranges = self.model, self.model.jnt_range
         for joint in [] if self.has_pose else self.driven:
@@ -328,13 +349,13 @@ class Robot:
             self.dt, self.decimation = _REACH_DT, round(_CONTROL_DT / _REACH_DT)
 
     def _servo_frequency(self, joint: int) -> float:
-        """Return the natural frequency of a joint with a position actuator in the default pose [rad/s]."""
+        """Return the natural frequency, in the default pose, of a joint with a position actuator [rad/s]."""
         actuator = self.actuator[joint]
         stiffness = -self.model.actuator_biasprm[actuator, 1] * self.model.actuator_gear[actuator, 0] ** 2
         return math.sqrt(stiffness / max(self.inertia[joint], 1e-9))
 
     def workspace(self) -> NDArray[np.float64]:
-        """Return positions that the last body reaches, in the frame of the fixed root. (n, 3) [m]"""
+        """Return sampled positions that the last body can reach, in the frame of the fixed root. (n, 3) [m]"""
         model, turn = self.model, np.zeros(9)
         mujoco.mju_quat2Mat(turn, model.body_quat[_ROOT])
         found = reachable_positions(model, self.data.qpos, self.driven, self.last_body(), self.offsets())
@@ -342,18 +363,19 @@ class Robot:
         return places
 
     def offsets(self) -> tuple[float, float]:
-        """Return the range of joint positions about the default pose in which goals are drawn [m or rad].
+        """Return the range of joint positions, relative to the default pose, from which goals are sampled [m or rad].
 
-        It includes a full turn of hinges; limits of the joints count in addition. Slides without limits move 0.5 m.
+        The range is +-pi, a full turn of a hinge, or +-0.5 if the robot has a driven slide without limits. A position
+        outside a joint's limits is not used.
         """
         endless = any(self.model.jnt_type[j] != SCALAR[0] and not self.model.jnt_limited[j] for j in self.driven)
         largest = 0.5 if endless else round3(math.pi)
         return -largest, largest
 
     def action_scales(self) -> dict[str, float]:
-        """Return the scale of each joint's action, by joint name [m or rad].
+        """Return the scale of each driven joint's action, by joint name [m or rad].
 
-        It is a quarter of the range of positions in which goals are drawn, and at most 1.
+        The scale is a quarter of the joint's limits or else of the range of `offsets`, and at most 1.
         """
         scales = {}
         for joint in self.driven:
@@ -365,6 +387,7 @@ class Robot:
         """Return the id of the body at the end of the longest chain of driven joints, such as a gripper."""
 
         def length(body: int) -> int:
+            """Return the number of driven joints between a body and the world."""
             count = 0
             while body:
                 count += sum(int(self.model.jnt_bodyid[j]) == body for j in self.driven)
@@ -375,7 +398,10 @@ class Robot:
 
 
 def _lowest_z(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float:
-    """Return the lowest z of a geom [m]: inf for planes, a lower bound for cylinders and ellipsoids, else exact."""
+    """Return the lowest world z coordinate of a geom [m].
+
+    The result is inf for a plane, a lower bound for cylinders and ellipsoids, and exact for other geoms.
+    """
     kind, size, turn = int(model.geom_type[geom]), model.geom_size[geom], data.geom_xmat[geom].reshape(3, 3)
     z, kinds = float(data.geom_xpos[geom, 2]), mujoco.mjtGeom
     if kind == int(kinds.mjGEOM_SPHERE):
@@ -397,5 +423,5 @@ def _count(number: int, one: str, several: str = "") -> str:
 
 
 def round3(value: float) -> float:
-    """Return a number, rounded to three significant digits."""
+    """Return a number rounded to three significant digits."""
     return float(f"{value:.3g}")

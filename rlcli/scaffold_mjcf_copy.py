@@ -1,6 +1,6 @@
-"""Copy of a robot's MJCF for a new task, with all names and asset files that the task needs.
+"""Functions that change a copy of a robot's MJCF for a new task: remove elements, add names, collect asset files.
 
-Ground, lights and keyframes are removed, because the task defines these itself.
+Ground, lights and keyframes are removed, because the task defines its own.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ FREE = int(mujoco.mjtJoint.mjJNT_FREE)
 
 
 def default_pose(spec: mujoco.MjSpec) -> np.ndarray | None:
-    """Return the robot's default pose as `qpos` (nq,), or None if the MJCF has no default pose.
+    """Return the robot's default pose as `qpos`, or None if the MJCF has no default pose. (nq,)
 
-    It is the pose of the keyframe `home` or `stand`, else of the first keyframe, else the value of the element
-    `numeric` with the name `init_qpos`.
+    The default pose is that of the keyframe `home`, `stand` or `standing`, else of the first keyframe, else the value
+    of the element `numeric` with the name `init_qpos`.
     """
     keys = sorted(spec.keys, key=lambda key: key.name not in ("home", "stand", "standing"))
     # Gymnasium's MJCFs store the start pose here
@@ -35,13 +35,13 @@ def default_pose(spec: mujoco.MjSpec) -> np.ndarray | None:
 def remove_scene_elements(spec: mujoco.MjSpec) -> list[str]:
     """Remove ground, lights and keyframes, which the task defines itself; name all bodies, joints and actuators.
 
-    Welds and connections to mocap bodies are removed, too: a task does not move mocap bodies, so they would hold the
-    robot. If as many joints are pulled by tendons as have an actuator of their own, the actuators of tendons are
-    removed, and the task drives these joints directly.
+    Equalities (weld, connect) with mocap bodies are removed, too: a task does not move mocap bodies, so the equalities
+    would hold the robot. If as many joints are pulled by tendons as have an actuator of their own, the actuators of
+    tendons and their sensors are removed, and the task drives these joints directly. `spec` is changed in place.
 
     Returns:
-        Names of the joints whose tendons have lost their actuators. It is empty if the robot has no other actuator:
-        then the task drives all joints.
+        Names of the joints whose tendons have lost their actuators. The list is empty if the robot has no other
+        actuator: then the task drives all joints.
     """
     pulled = _replace_tendon_actuators(spec)
     for key in list(spec.keys):
@@ -85,10 +85,14 @@ def _replace_tendon_actuators(spec: mujoco.MjSpec) -> list[mujoco.MjsJoint]:
 
 
 def put_robot_first(tree: ElementTree.Element, model: mujoco.MjModel) -> None:
-    """Make the top-level body with most driven joints the first one, because rlcli takes the first body as the root.
+    """Move the top-level body with most driven joints to the front, because rlcli takes the first body as the root.
 
-    If the body has a free joint, it is placed at the origin. If its z axis does not point up, `_insert_level_root`
-    gives it a parent whose z axis does.
+    If the body has a free joint, the body is placed at the origin, and other bodies are moved by the same vector. If
+    the z axis of a body with a free joint does not point up, `_insert_level_root` gives the body a new parent.
+
+    Args:
+        tree: the MJCF, which is changed.
+        model: the compiled MJCF.
     """
     joint_actuator = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)
     driven = model.actuator_trnid[joint_actuator, 0] if model.nu else np.flatnonzero(np.isin(model.jnt_type, SCALAR))
@@ -110,9 +114,9 @@ def put_robot_first(tree: ElementTree.Element, model: mujoco.MjModel) -> None:
 
 
 def _insert_level_root(body: ElementTree.Element) -> None:
-    """Give a free body a new parent with the free joint, whose z axis points up: terms read the tilt of the root.
+    """Give a body with a free joint a new parent whose z axis points up, because terms read the tilt of the root.
 
-    The element of the body becomes the new parent, and a copy of the body its child.
+    The free joint moves to the new parent. The element `body` becomes the new parent, and a copy of the body its child.
     """
     child = ElementTree.Element("body", body.attrib | {"pos": "0 0 0"})
     joints = [part for part in body if part.tag == "freejoint" or part.get("type") == "free"]
@@ -124,7 +128,16 @@ def _insert_level_root(body: ElementTree.Element) -> None:
 
 
 def collect_assets(tree: ElementTree.Element, spec: mujoco.MjSpec, file: Path) -> dict[str, Path]:
-    """Change the paths of all files that an MJCF loads to the folder `assets`; return new path -> present file."""
+    """Change the paths of all files that an MJCF loads to the folder `assets`; return new path -> present file.
+
+    Args:
+        tree: the MJCF, which is changed.
+        spec: the MJCF as read by MuJoCo, with the folders of its meshes and textures.
+        file: file of the MJCF.
+
+    Raises:
+        ValueError: if a file does not exist.
+    """
     found: dict[str, Path] = {}
     home = Path(spec.modelfiledir or file.parent)
     for element in tree.iter():
@@ -151,9 +164,9 @@ def collect_assets(tree: ElementTree.Element, spec: mujoco.MjSpec, file: Path) -
 
 
 def compile_copy(xml: str, assets: Mapping[str, Path]) -> mujoco.MjModel:
-    """Compile an MJCF text with the files `assets` (path in the MJCF -> file), which are given to MuJoCo in memory.
+    """Compile an MJCF from text, with the files `assets` (path in the MJCF -> file), which are read into memory.
 
     Raises:
-        ValueError: if MuJoCo cannot compile it, for example because it needs a further file.
+        ValueError: if MuJoCo cannot compile the MJCF, for example because a file is missing in `assets`.
     """
     return mujoco.MjModel.from_xml_string(xml, {place: origin.read_bytes() for place, origin in assets.items()})

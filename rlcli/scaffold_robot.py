@@ -1,8 +1,8 @@
 """Task design for `rlcli new --robot`: read an MJCF, choose a kind of task, and return the model and the YAML data.
 
-velocity: a floating base with feet, at least four driven joints and fewer passive ones follows velocity commands.
-reach: a fixed base with two or more joints, all driven, brings its last body to goals. balance: any other robot keeps
-its default pose.
+velocity: follow velocity commands, for a robot with a floating base, feet, at least four driven joints, and fewer
+passive joints than driven ones. reach: bring the last body to goals, for a robot with a fixed base and at least two
+joints, all driven. balance: keep the default pose, for any other robot.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from rlcli.scene.untrusted_mjcf import read_mjcf
 
 _TEMPLATES = Path(__file__).parent / "templates" / "robot_tasks"
 
-_AGENT_VALUES: dict[str, dict[str, Any]] = {
+_AGENT_VALUES: dict[str, dict[str, Any]] = {  # kind of task -> values of the template `agent.yaml`
     "velocity": {"max_iterations": 1500, "gamma": 0.99, "entropy_coef": 0.005},
     # a horizon of 0.7 s, in which an arm reaches most goals; little noise at the end, so that the arm settles
     "reach": {"max_iterations": 1000, "gamma": 0.97, "entropy_coef": 0.001},
@@ -36,7 +36,7 @@ _AGENT_VALUES: dict[str, dict[str, Any]] = {
 
 @dataclass(slots=True)
 class RobotTask:
-    """Task for one robot: the content of its files, and the names of the elements in the robot's MJCF."""
+    """Task for a robot: the content of the task's files, and the names of the elements in the robot's MJCF."""
 
     kind: str
     """Kind of the task: velocity, reach or balance."""
@@ -45,7 +45,7 @@ class RobotTask:
     model: str
     """The MJCF of the task."""
     assets: dict[str, Path]
-    """File in the task's package -> file to copy."""
+    """Path of an asset file in the task's package -> file to copy."""
     task: dict[str, Any]
     """The task as data of its YAML."""
     found: dict[str, list[str]]
@@ -53,7 +53,7 @@ class RobotTask:
     has_pose: bool
     """Whether the MJCF has a default pose: a keyframe, or the element `numeric` with the name `init_qpos`."""
     doubts: list[tuple[str, str]]
-    """Message and hint for each property of the MJCF that is probably an error, such as a wrong unit."""
+    """(message, hint) for each property of the MJCF that is probably an error, such as a wrong unit."""
 
 
 def read_robot(file: Path, name: str, kind: str | None = None) -> RobotTask:
@@ -65,12 +65,13 @@ def read_robot(file: Path, name: str, kind: str | None = None) -> RobotTask:
         kind: velocity, reach or balance; None: the kind that fits the robot.
 
     Raises:
-        UsageError: if there is no such file, the robot has nothing that can be controlled, or the kind is impossible.
+        UsageError: if there is no such file, no joint of the robot can be driven, or the kind is unknown or impossible
+            for the robot.
         TaskError: if MuJoCo cannot compile the model, or it has an element that rlcli refuses.
     """
     if file.is_dir():
         models = sorted(entry.name for entry in file.glob("*.xml"))
-        inside = f"give one of its files: {listing(models)}" if models else "give the MJCF of a robot, a file in it"
+        inside = f"give a file in the folder: {listing(models)}" if models else "give the MJCF file of a robot"
         raise UsageError(f"--robot: {file} is a folder", hint=inside)
     if not file.is_file():
         raise UsageError(f"--robot: there is no file {file}", hint="give the MJCF of a robot, as in --robot robot.xml")
@@ -88,10 +89,10 @@ def read_robot(file: Path, name: str, kind: str | None = None) -> RobotTask:
         )
     fitting, reason = robot.fitting_kind()
     if kind is None:
-        kind, reason = fitting, f"{reason}; --kind chooses another"
+        kind, reason = fitting, f"{reason}; --kind chooses another kind"
     else:
         require_known(kind, list(_SUMMARIES), "kind of task", "kinds")
-        reason = f"--kind says so; without it {fitting}, because {reason}"
+        reason = f"--kind says so; without --kind {fitting}, because {reason}"
         if obstacle := robot.obstacle_to(kind):
             raise UsageError(f"--kind {kind} is impossible for {file}: {obstacle}", hint=f"try --kind {fitting}")
     if kind == "reach":
@@ -117,9 +118,10 @@ def read_robot(file: Path, name: str, kind: str | None = None) -> RobotTask:
 
 
 def _asset_roots(file: Path) -> list[Path]:
-    """Return the folders from which an MJCF may load: its own, the parent, its Python package, and its repository.
+    """Return the folders from which an MJCF may load files.
 
-    A repository that contains the home folder, such as one of dotfiles, does not count.
+    They are the folder of the MJCF, its parent, its Python package and its repository, unless the repository contains
+    the home folder, such as a repository of dotfiles.
     """
     home = Path.home()
     own = [folder for folder in file.parents if folder != home and folder not in home.parents]
@@ -129,6 +131,7 @@ def _asset_roots(file: Path) -> list[Path]:
 
 
 _PROJECT_MARKS = (".git", "pyproject.toml", "package.xml")
+"""Files or folders by which the top folder of a repository is found."""
 _SUMMARIES = {
     "velocity": "Follow velocity commands",
     "reach": "Bring the last body to goals",
@@ -140,6 +143,7 @@ def _fill(name: str, values: Mapping[str, Any]) -> dict[str, Any]:
     """Return the data of the YAML template `name`, with each value `$key` replaced by `values[key]`."""
 
     def filled(node: Any) -> Any:
+        """Return a node of the data with its values replaced."""
         if isinstance(node, dict):
             return {key: filled(item) for key, item in node.items()}
         if isinstance(node, list):
@@ -151,6 +155,7 @@ def _fill(name: str, values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _velocity(robot: Robot) -> dict[str, Any]:
+    """Return the sections of a task with velocity commands for a robot, as data of its YAML."""
     speed = round3(math.sqrt(robot.gravity * robot.com_height / 15.0))  # a slow walk for every size: Froude number 1/15
     yaw_rate = round3(0.6 / robot.tempo)
     values = {
@@ -172,6 +177,7 @@ def _velocity(robot: Robot) -> dict[str, Any]:
 
 
 def _reach(robot: Robot) -> dict[str, Any]:
+    """Return the sections of a reaching task for a robot, as data of its YAML."""
     extents = np.ptp(robot.workspace(), axis=0)
     size = float(extents.max())
     values = {
@@ -190,6 +196,7 @@ def _reach(robot: Robot) -> dict[str, Any]:
 
 
 def _balance(robot: Robot) -> dict[str, Any]:
+    """Return the sections of a balance task for a robot, as data of its YAML."""
     moving = sorted([*robot.driven, *robot.passive])
     posed = [j for j in moving if not robot.is_wheel(j)]
     if not posed and not robot.free:
@@ -223,7 +230,7 @@ def _balance(robot: Robot) -> dict[str, Any]:
 def _balance_conditions(robot: Robot, held: dict[float, list[str]]) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the sections `success` and `terminations` of a balance task.
 
-    They limit the tilt of a floating base; for a fixed base, the deviation of the joints from the default pose.
+    For a floating base, the sections limit the tilt; for a fixed base, the deviation of joints from the default pose.
 
     Args:
         robot: the robot.

@@ -1,7 +1,7 @@
-"""Access to the user's settings of the command line, which hold for all folders and are never part of a task.
+"""Access to the user's settings of the command line, which apply in all folders and are never part of a task.
 
-The file `settings.yaml` is in the platform's folder for user configuration; `rlcli.config.user_settings` reads it.
-Precedence: flag, environment variable, settings file, default. Programs that import the library ignore the file.
+The file `settings.yaml` is in the platform's folder for user configuration; `rlcli.config.user_settings` reads the
+file. Precedence: flag, environment variable, settings file, default. Programs that import the library ignore the file.
 """
 
 import os
@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 NO_FILE = "none"
-"""Value of RLCLI_SETTINGS that means: read no settings file."""
+"""Value of the environment variable RLCLI_SETTINGS that means: read no settings file."""
 
 
 def settings_file() -> Path | None:
-    """Return the path of the settings file, whether it exists or not; None if RLCLI_SETTINGS is `none`."""
+    """Return the path of the settings file, which may not exist; None if RLCLI_SETTINGS is `none`."""
     named = os.environ.get("RLCLI_SETTINGS", "").strip()
     if named:
         return None if named == NO_FILE else Path(os.path.expanduser(named))
@@ -25,11 +25,12 @@ def settings_file() -> Path | None:
 
 
 _current: Mapping[str, Any] = {}
+"""Key -> value of the settings in use."""
 
 
 @contextmanager
 def use_settings(settings: Mapping[str, Any]) -> Iterator[None]:
-    """Use these settings (key -> value) for `setting` inside the `with` block."""
+    """Make `setting` return the values of `settings` (key -> value) inside a `with` block."""
     global _current
     before, _current = _current, settings
     try:
@@ -39,5 +40,5 @@ def use_settings(settings: Mapping[str, Any]) -> Iterator[None]:
 
 
 def setting(key: str) -> Any:
-    """Return a setting of the user by its key; None if the file does not set it, or rlcli is used as a library."""
+    """Return a setting of the user; None if the settings file does not have the key, or rlcli is used as a library."""
     return _current.get(key)

@@ -1,26 +1,26 @@
-"""Interface of task plugins: `TaskSpec`, and the type aliases for the parameters of terms."""
+"""Interface for plugins with tasks: the class `TaskSpec`, and the type aliases for the parameters of terms."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias, get_type_hints
 
 API_VERSION = 1
-"""Version of the plugin interface. A plugin that needs a newer version is refused, with both numbers."""
+"""Version of the plugin interface. A plugin that needs a newer version is refused; the message has both versions."""
 
 
 @dataclass(frozen=True, slots=True)
 class TaskSpec:
     """A task of a plugin. An entry point of the group `rlcli.tasks` names an object of this class.
 
-    The module that defines the object must be cheap to import. The name of the task is the name of the entry point, and
-    its owner is the distribution (the installed package) that declares the entry point.
+    The module that defines the object must be cheap to import. The name of the task is the name of the entry point. The
+    task belongs to the distribution (the installed package) that declares the entry point.
 
     Attributes:
-        package: the package that holds the YAML and the models, usually `__name__`.
-        summary: one line for `list-tasks`.
+        package: the Python package that has the YAML and the models, usually `__name__`.
+        summary: one line that describes the task, for `rlcli list-tasks`.
         config: the YAML file, relative to the package; or `module:attribute`, a `TaskConfig` built in Python.
         task: the direct task class as `module:Class`; None for a manager-based task.
-        terms: modules whose functions the YAML may name. They are searched before `rlcli.mdp`.
+        terms: modules whose functions the YAML may name; these modules are searched before `rlcli.mdp`.
         agents: further agents of a configuration in Python: name -> `module:attribute`.
         policies: a folder, relative to the package. Its subfolder `NAME` is the trained policy of the task `NAME`, as
             `rlcli export --format bundle` writes it. Trained policies are optional.
@@ -44,7 +44,7 @@ def require_field_types(spec: Any) -> None:
     """Check the types of the fields of a plugin's `TaskSpec`, `TrainerSpec` or `FormatSpec`.
 
     Raises:
-        TypeError: with the name of the first wrong field.
+        TypeError: if a field has a wrong type; with the name of the first such field.
     """
     for name, kind in get_type_hints(type(spec)).items():
         value = getattr(spec, name)
@@ -60,10 +60,11 @@ _KINDS: dict[Any, str] = {
     tuple[str, ...]: "a tuple of strings, such as ('a',)",
     Mapping[str, str]: "a mapping from strings to strings",
 }
-"""Types of the fields of specs, in words."""
+"""Type of a field -> description for messages."""
 
 
 def _has_type(value: Any, kind: Any) -> bool:
+    """Return whether a value has one of the types in `_KINDS`; a list is accepted for a tuple."""
     if kind == str | None:
         return value is None or isinstance(value, str)
     if kind == tuple[str, ...]:
@@ -77,41 +78,49 @@ def _has_type(value: Any, kind: Any) -> bool:
 # index that they resolve to in the compiled model. A type checker sees Any, because the default in the signature is the
 # name ("robot"), while the body of the function uses the object.
 Entity: TypeAlias = Any
-"""An entity of the scene. YAML: its name. At run time: `rlcli.scene.entity.Entity`."""
+"""An entity of the scene. In YAML: its name. At run time: an `rlcli.scene.entity.Entity`."""
 Joints: TypeAlias = Any
-"""Hinge and slide joints of `entity`, in the order of the YAML. At run time: an index into joint columns."""
+"""Hinge and slide joints of the parameter `entity`. In YAML: names or regular expressions. At run time: an index of the
+joints' columns in tensors such as `entity.data.joint_pos`, in the order of the YAML."""
 Bodies: TypeAlias = Any
-"""Bodies of `entity`. At run time: an index into body columns."""
+"""Bodies of the parameter `entity`. In YAML: names or regular expressions. At run time: an index of the bodies' columns
+in tensors of `entity.data`."""
 Sites: TypeAlias = Any
-"""Sites of `entity`. At run time: an index into site columns."""
+"""Sites of the parameter `entity`. In YAML: names or regular expressions. At run time: an index of the sites' columns
+in tensors of `entity.data`."""
 Sensors: TypeAlias = Any
-"""MJCF sensors of `entity`. At run time: an index into sensor-data columns."""
+"""MJCF sensors of the parameter `entity`. In YAML: names or regular expressions. At run time: an index of the sensors'
+columns in `sensordata`."""
 Actuators: TypeAlias = Any
-"""Actuators of `entity`. At run time: an index into actuator columns."""
+"""Actuators of the parameter `entity`. In YAML: names or regular expressions. At run time: an index of the actuators'
+columns in tensors of `entity.data`."""
 Geoms: TypeAlias = Any
-"""Geoms of `entity`. At run time: an index into the names of its geoms."""
+"""Geoms of the parameter `entity`. In YAML: names or regular expressions. At run time: an index into the list of the
+names of the entity's geoms."""
 Tendons: TypeAlias = Any
-"""Tendons of `entity`. At run time: an index into the names of its tendons."""
+"""Tendons of the parameter `entity`. In YAML: names or regular expressions. At run time: an index into the list of the
+names of the entity's tendons."""
 Pairs: TypeAlias = Any
-"""Contact pairs of `entity`. At run time: an index into the names of its pairs."""
+"""Contact pairs of the parameter `entity`. In YAML: names or regular expressions. At run time: an index into the list
+of the names of the entity's contact pairs."""
 ContactSensor: TypeAlias = Any
-"""A contact sensor. YAML: its name in `scene.sensors`. At run time: `rlcli.scene.sensors.ContactSensor`."""
+"""A contact sensor. In YAML: its name in `scene.sensors`. At run time: an `rlcli.scene.sensors.ContactSensor`."""
 RaySensor: TypeAlias = Any
-"""A ray sensor of the scene. YAML: its name in `scene.sensors`. At run time: `rlcli.scene.sensors.RaySensor`."""
+"""A ray sensor. In YAML: its name in `scene.sensors`. At run time: an `rlcli.scene.sensors.RaySensor`."""
 CameraSensor: TypeAlias = Any
-"""A camera of the scene. YAML: its name in `scene.sensors`. At run time: `rlcli.scene.camera.CameraSensor`."""
+"""A camera. In YAML: its name in `scene.sensors`. At run time: an `rlcli.scene.camera.CameraSensor`."""
 Command: TypeAlias = Any
-"""A term of `commands:`. YAML: its name. At run time: the term, whose `.command` is (num_envs, k)."""
+"""A term of the section `commands`. In YAML: its name. At run time: the term; its `.command` is (num_envs, k)."""
 Address: TypeAlias = Any
-"""A number or a list of numbers of this configuration that may change during training. YAML: its dotted key.
+"""A number or a list of numbers in the task's configuration that may change during training. In YAML: its dotted key.
 At run time: a tensor on the environment's device. A value that is written into this tensor takes effect wherever the
 number is used."""
 Range: TypeAlias = tuple[float, float]
-"""`[low, high]` with low <= high."""
+"""Range `[low, high]` with low <= high."""
 
 
 def reads_body_forces(term: Any) -> Any:
-    """Mark a term that reads `body_lin_acc_w`, `body_ang_acc_w` or `body_incoming_wrench_b` of an entity.
+    """Mark (as a decorator) a term that reads `body_lin_acc_w`, `body_ang_acc_w` or `body_incoming_wrench_b`.
 
     MuJoCo computes accelerations and forces of bodies only if a sensor of the model needs them. If a task uses a marked
     term, rlcli adds such a sensor to the model.

@@ -17,13 +17,13 @@ class TrainerSpec:
 
     Attributes:
         summary: one line that describes the trainer.
-        algorithms: algorithm name -> `module:Model`, the pydantic model of its settings (an `AgentConfig`). If the
-            `algorithm` of an agent is a mapping, its key `class_name` names the algorithm; without that key it is the
-            first one.
+        algorithms: name of an algorithm -> `module:Model`, the pydantic model of the algorithm's settings (a subclass
+            of `AgentConfig`). If the `algorithm` of an agent is a mapping, its key `class_name` names the algorithm;
+            without that key, the first algorithm is used.
         trainer: `module:Class` of a `Trainer`, called as `Class(env, config, seed=, device=, torch_threads=)`.
-        refused: algorithms that the library has and this trainer cannot run -> the reason.
+        refused: name of an algorithm that the trainer's library has, but this trainer cannot run -> the reason.
         parallel: whether several processes can train one policy (`rlcli.rl.distributed`).
-        gpu: whether the trainer can train on a GPU, with all tensors on it; otherwise `--device auto` is the CPU.
+        gpu: whether the trainer can train on a GPU, with all tensors on the GPU; if not, `--device auto` is the CPU.
         api: the `API_VERSION` that the trainer was written for.
     """
 

@@ -13,8 +13,8 @@ def test_text_of_an_error_without_text(failure):
                 raise failure
             return 5
 
-    assert "its message cannot be read" in error_text(Textless())
-    assert "its message cannot be read" in one_line(Textless())
+    assert "the error's message cannot be read" in error_text(Textless())
+    assert "the error's message cannot be read" in one_line(Textless())
 
 
 def test_long_text_of_an_error_is_cut_before_it_is_split():

@@ -357,7 +357,7 @@ def hold_command(env: VecEnv, name: str, value: float | None) -> None:
     """
     manager = _commands(env)
     if manager is None:
-        raise UsageError(f"the task has no command '{name}'", hint="leave out --command: this task has no commands")
+        raise UsageError(f"the task has no command '{name}'", hint="leave out --command: the task has no commands")
     manager.hold(name, value)
 
 

@@ -31,7 +31,7 @@ def test_seed_is_an_integer_in_range(seed):
 
 
 def test_wrong_arguments_are_usage_errors():
-    with pytest.raises(UsageError, match="no task and no run to resume given"):
+    with pytest.raises(UsageError, match="neither a task nor a run to resume is given"):
         train()
     with pytest.raises(UsageError, match=r"overrides must be a list, found the string 'rewards\.alive\.weight=2'"):
         make("cartpole", overrides="rewards.alive.weight=2")

@@ -286,7 +286,7 @@ def test_repeated_tensor_does_not_fill_the_memory(monkeypatch):
     monkeypatch.setattr("rlcli.training.import_policy.available_memory", lambda: 2**26)
     one = torch.zeros(1000, 1000)
     torch.save({"model_state_dict": {f"actor.{i}.weight": one for i in range(50)}}, "model.pt")
-    assert "over 16,777,216 bytes" in refused("rsl-rl", "model.pt")
+    assert "more than 16,777,216 bytes" in refused("rsl-rl", "model.pt")
 
 
 @pytest.mark.parametrize(
@@ -392,7 +392,7 @@ def test_long_number_in_a_pickle_gives_no_advice_to_change_python(opcode, capfd)
         archive.writestr("archive/version", "3")
     assert main(["import", "rsl-rl", "model.pt", "--task", "cartpole"]) == 5
     message = capfd.readouterr().err
-    assert "model.pt is corrupt: it has a number of more than 4300 digits; save the file again" in message
+    assert "model.pt is corrupt: a number has more than 4300 digits; save the file again" in message
 
 
 SHARED = b"N" + b"".join(b"q%ch%c\x86" % (i, i) for i in range(60))

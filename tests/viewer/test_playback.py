@@ -401,7 +401,7 @@ def test_removed_checkpoint_is_reported_and_policy_stays(playing):
     assert playback.view.checkpoint == newest
     assert first not in playback.view.checkpoints
     assert f"step {first} cannot be played, the current policy continues" in log.messages[0]
-    assert "was deleted" in playback.view.message
+    assert "does not exist (training deletes old checkpoints)" in playback.view.message
 
 
 @pytest.mark.parametrize(

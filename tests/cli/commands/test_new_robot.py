@@ -197,12 +197,12 @@ def test_only_reaching_changes_the_usual_time_step(cli, tmp_path):
 
 def test_the_reason_for_the_kind_is_printed(cli, tmp_path):
     for text, kind, reason in (
-        (DOG, "velocity", "its base floats, it has 4 feet and 4 driven joints"),
-        (CART, "balance", "its base is fixed, but 1 of its joints has no actuator of its own (hinge)"),
-        (ARM, "reach", "its base is fixed, and all of its 3 joints are driven"),
-        (POINT.format(kind="hinge"), "balance", "its joints do not move its last body 'point' by more than 1 cm"),
+        (DOG, "velocity", "the robot's base floats, and it has 4 feet and 4 driven joints"),
+        (CART, "balance", "the robot's base is fixed, but 1 of its joints has no actuator of its own (hinge)"),
+        (ARM, "reach", "the robot's base is fixed, and all 3 joints are driven"),
+        (POINT.format(kind="hinge"), "balance", "the joints do not move the last body 'point' by more than 1 cm"),
         (UNICYCLE, "balance", "only 2 driven joints"),
-        (DOG.replace("<worldbody>", '<option gravity="0 0 0"/><worldbody>'), "balance", "there is no gravity"),
+        (DOG.replace("<worldbody>", '<option gravity="0 0 0"/><worldbody>'), "balance", "the file sets gravity to 0"),
     ):
         result, _ = written(cli, tmp_path, text)
         assert f"task: {kind}, because" in result.err
@@ -214,10 +214,10 @@ def test_the_kind_can_be_chosen(cli, tmp_path):
     (tmp_path / "robot.xml").write_text(CART)
     result = cli("new", "my-robot", "--robot", "robot.xml", "--kind", "reach", "--json")
     assert (result.code, result.json["flavour"]) == (0, "reach")
-    assert "task: reach, because --kind says so; without it balance" in result.err
+    assert "task: reach, because --kind says so; without --kind balance" in result.err
     assert cli("validate", "--deep", "my-robot/my_robot").code == 0
     for kind, message in (
-        ("velocity", "impossible for robot.xml: its base is fixed"),
+        ("velocity", "impossible for robot.xml: the robot's base is fixed"),
         ("walk", "no kind of task 'walk'"),
     ):
         refused = cli("new", "other-robot", "--robot", "robot.xml", "--kind", kind)
