@@ -167,16 +167,28 @@ def find_checkpoint(
         return run, run.checkpoints / f"{best:012d}", "its best evaluation"
     kind, _, number = which.partition(":")
     if kind == "step" and re.fullmatch("[0-9]{1,30}", number):
-        if int(number) not in have:
-            raise CheckpointError(
-                f"{run.folder} has no checkpoint at step {number}",
-                hint=f"the run has checkpoints at these steps: {listing(map(str, have))}",
-            )
+        require_step(run, int(number))
         return run, run.checkpoints / f"{int(number):012d}", "as named"
     raise CheckpointError(
         f"'{reference}' does not name a checkpoint",
         hint="write RUN, RUN@best, RUN@step:N, the folder of a checkpoint, or latest",
     )
+
+
+def require_step(run: Run, step: int) -> None:
+    """Check that a run has a checkpoint at an environment step.
+
+    Raises:
+        CheckpointError: with the steps of the run's checkpoints.
+    """
+    from rlcli.runs.checkpoint_reader import steps
+
+    have = steps(run.checkpoints)
+    if step not in have:
+        raise CheckpointError(
+            f"{run.folder} has no checkpoint at step {step}",
+            hint=f"the run has checkpoints at these steps: {listing(map(str, have))}",
+        )
 
 
 def _newest_valid(run: Run, have: list[int], why: str, whole: bool) -> tuple[Path, str]:

@@ -14,7 +14,7 @@ from rlcli.cli.ui.completion import runs_and_tasks
 from rlcli.cli.ui.console import console
 from rlcli.cli.ui.difference_table import report_differences
 from rlcli.cli.ui.options import Agent, RunsDir, choice
-from rlcli.errors import CheckpointError, TaskError, UsageError, did_you_mean, listing, require_known
+from rlcli.errors import CheckpointError, TaskError, UsageError, did_you_mean, require_known
 from rlcli.registry import TASKS, catalog, task_source
 from rlcli.registry.find import path_of
 
@@ -150,6 +150,7 @@ def _compare_configurations(one: Resolved | Run, other: Resolved | Run, left: Si
 
 def _compare_runs(left: str, right: str, runs: Path, only: list[str] | None) -> bool:
     from rlcli.runs.run_diff import SECTIONS, compare
+    from rlcli.runs.run_ref import require_step
 
     one, step = _find(left, runs)
     other, other_step = _find(right, runs)
@@ -159,7 +160,7 @@ def _compare_runs(left: str, right: str, runs: Path, only: list[str] | None) -> 
     until = step if step is not None else other_step
     if until is not None:
         for run in (one, other):
-            _require_step(run, until)
+            require_step(run, until)
     sections = compare(one, other, sections=only or SECTIONS, until=until)
     return report_differences("diff", sections, str(one.folder), str(other.folder), step=until)
 
@@ -182,14 +183,3 @@ def _find(reference: str, runs: Path) -> tuple[Run, int | None]:
     if reference == "latest":
         console.info(f"{run.folder} ({why})")
     return run, None
-
-
-def _require_step(run: Run, step: int) -> None:
-    from rlcli.runs.checkpoint_reader import steps
-
-    have = steps(run.checkpoints)
-    if step not in have:
-        raise CheckpointError(
-            f"{run.folder} has no checkpoint at step {step}",
-            hint=f"the run has checkpoints at these steps: {listing(map(str, have))}",
-        )
