@@ -227,8 +227,10 @@ def _run(arguments: list[str]) -> int:
     except BaseException as raised:  # the code of a task may raise any exception
         cause = raised.error if isinstance(raised, BodyError) else raised
         failure = _as_rlcli_error(cause, arguments)
-        if failure.kind == "bug":
-            failure = broken or (not isinstance(cause, SystemExit) and change_of_module(cause)) or failure
+        if failure.kind == "bug" or (isinstance(cause, ImportError) and copies.lost_modules):
+            is_exit = isinstance(cause, SystemExit)
+            by_module = None if is_exit else change_of_module(cause) or copies.error_of_lost_modules(cause)
+            failure = broken or by_module or failure
         if failure.kind == "bug" and isinstance(cause, SystemExit):
             # the exception is not from a task or plugin: typer itself ends completions and closed pipes in this way
             raise

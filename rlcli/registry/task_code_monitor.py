@@ -44,10 +44,10 @@ def error_of_task(error: BaseException) -> TaskError | None:
     found = [each for each in _frames_of(error) if is_task_code(each[0])]
     if not found or (isinstance(error, OSError | EOFError) and not raised_by_task(error)):
         return None
-    frame, line = found[-1]
-    code, hint = frame.f_code, getattr(error, "hint", None)
+    frame, line = next((each for each in reversed(found) if not _is_from_string(each[0])), found[-1])
+    hint = getattr(error, "hint", None)
     return TaskError(
-        f"{code.co_filename}:{line}: {code.co_name}: {short_error(error)}",
+        f"{_place(frame, line)}: {frame.f_code.co_name}: {short_error(error)}",
         hint=hint if isinstance(hint, str) else "correct the task's code at this line; --debug shows the traceback",
     )
 
@@ -77,8 +77,34 @@ def raised_by_task(error: BaseException) -> bool:
 
 
 def is_task_code(frame: FrameType) -> bool:
-    """Return whether a frame runs code of a task: a file of an installed plugin, or outside of rlcli and libraries."""
-    return is_task_file(frame.f_code.co_filename, _module(frame).partition(".")[0])
+    """Return whether a frame runs code of a task: a file of an installed plugin, or outside of rlcli and libraries.
+
+    Code from a string (`exec`) belongs to the file of the module in whose namespace it runs.
+    """
+    file = frame.f_globals.get("__file__") if _is_from_string(frame) else frame.f_code.co_filename
+    return isinstance(file, str) and is_task_file(file, _module(frame).partition(".")[0])
+
+
+def _is_from_string(frame: FrameType) -> bool:
+    return frame.f_code.co_filename.startswith("<")
+
+
+def _place(frame: FrameType, line: int | None = None) -> str:
+    """Return file and line of a frame that runs code of a task."""
+    line = frame.f_lineno if line is None else line
+    if _is_from_string(frame):
+        return f"{frame.f_globals.get('__file__')}: line {line} of code in a string"
+    return f"{frame.f_code.co_filename}:{line}"
+
+
+def _innermost(frames: Iterable[FrameType]) -> FrameType | None:
+    """Return the innermost frame with code of a task, or None; if possible one with a file, not code from a string.
+
+    Args:
+        frames: the frames of the running code, the innermost first.
+    """
+    found = [frame for frame in frames if is_task_code(frame)]
+    return next((frame for frame in found if not _is_from_string(frame)), found[0] if found else None)
 
 
 @functools.cache
@@ -141,7 +167,7 @@ def observe_task_code() -> Iterator[None]:
     def on_error(other: Callable[[Any], Any]) -> Callable[[Any], None]:
         def hook(found: Any) -> None:
             frames = [each for each in traceback.walk_tb(found.exc_traceback) if is_task_code(each[0])]
-            place = f"{frames[-1][0].f_code.co_filename}:{frames[-1][1]}" if frames else place_in_task(sys._getframe(1))
+            place = _place(*frames[-1]) if frames else place_in_task(sys._getframe(1))
             if found.exc_value is None or place is None:
                 other(found)
             # SystemExit in a thread only ends this thread
@@ -204,8 +230,8 @@ def place_in_task(frame: FrameType | None) -> str | None:
 
 
 def _innermost_place(frames: Iterable[FrameType]) -> str | None:
-    inner = next((each for each in frames if is_task_code(each)), None)
-    return None if inner is None else f"{inner.f_code.co_filename}:{inner.f_lineno}"
+    inner = _innermost(frames)
+    return None if inner is None else _place(inner)
 
 
 def frames_of_thread(thread: int | None) -> list[FrameType]:
@@ -256,6 +282,8 @@ def exit_refused() -> Iterator[None]:
             frame = sys._getframe(1)
             if frame.f_back is not None and _module(frame) == "pty":
                 frame = frame.f_back
+            while frame.f_back is not None and _is_from_string(frame) and "__file__" not in frame.f_globals:
+                frame = frame.f_back  # `exec(code, {})` runs in a namespace without a file
             if is_task_code(frame):
                 raise RuntimeError(f"os.{name} would continue the command in two processes; use subprocess instead")
             return before()
@@ -337,22 +365,18 @@ class _Watch(threading.Thread):
             call = next((frame for frame, begin in since.items() if now - begin >= SLOW_S - _SAMPLE_S), None)
             if call is not None and call.f_code not in self._reported:
                 self._reported.add(call.f_code)
-                self._warn_of(call, next(each for each in frames if is_task_code(each) or each is call))
+                self._warn_of(call, _innermost(frames[: frames.index(call)]) or call)
             frames, call = [], None
 
     @staticmethod
     def _warn_of(call: FrameType, inner: FrameType) -> None:
         """Warn of a call that does not return; `inner` is the innermost code of the task that runs in it."""
         entry, advice = _plugin(call), ""
-        place = f"{call.f_code.co_filename}:{call.f_lineno}: "
+        place = f"{_place(call)}: "
         if entry is not None:
             place = f"plugin {entry.distribution} {entry.version}: {place}"
             advice = "; if the call does not end, exclude the plugin with RLCLI_PLUGINS=none"
-        at = (
-            ""
-            if inner is call
-            else f"; the call is at {inner.f_code.co_filename}:{inner.f_lineno}, {inner.f_code.co_name}"
-        )
+        at = "" if inner is call else f"; the call is at {_place(inner)}, {inner.f_code.co_name}"
         warn_once(f"{place}{call.f_code.co_name} has not returned for {SLOW_S:g} s{at}{advice}")
 
 

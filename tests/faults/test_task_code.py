@@ -239,6 +239,9 @@ CHANGES = {
     "del os.replace": "os.replace",
     "setattr(threading.Thread, 'start', None)": "threading.Thread.start",
     "sys.modules.clear()": "sys.modules",
+    "sys.modules.update(dict.fromkeys(sys.modules))": "sys.modules",
+    "sys.modules.update({name: 3 for name in sys.modules})": "sys.modules",
+    "exec('torch.zeros = torch.ones = None')": "torch.ones",
 }
 
 
@@ -251,6 +254,44 @@ def test_hook_that_breaks_a_library_is_named(with_code, start, code):
     assert process.returncode == 4, err
     assert "Traceback" not in err
     assert f"coin/task.py:{line}: code of the task changes {CHANGES[code]}, which is probably the reason for" in err
+
+
+@pytest.mark.parametrize("words", [TRAIN, EVAL], ids=["train", "eval"])
+def test_hook_that_breaks_modules_under_another_name_is_named(with_code, start, words):
+    line = with_code("calculate_metrics", "import sys; m = sys.modules; [m.update({k: None}) for k in list(m)[::2]]")
+    process = start(*words)
+    _, err = process.communicate()
+    assert process.returncode == 4, err
+    assert "Traceback" not in err
+    assert f"coin/task.py:{line}: code of the task has removed or replaced " in err
+    assert "not installed" not in err
+
+
+IN_A_STRING = {
+    "def f(self): 1 / 0": "ZeroDivisionError: division by zero",
+    "def f(self): os._exit(7)": "SystemExit: it called os._exit(7)",
+    "def f(self): os.fork()": "RuntimeError: os.fork would continue",
+    "def f(self): exec('import os; os.fork()', {})": "RuntimeError: os.fork would continue",
+}
+
+
+@pytest.mark.parametrize("code", IN_A_STRING)
+@pytest.mark.parametrize("words", [EVAL, TRAIN], ids=["eval", "train"])
+def test_hook_from_a_string_is_named_with_the_file_of_the_task(coin, cli, tmp_path, words, code):
+    after = f"namespace = globals(); exec({code!r}, namespace); Task.calculate_metrics = namespace['f']"
+    (tmp_path / "coin" / "task.py").write_text(f"import os\n{COIN_TASK}\n{after}\n")
+    found = cli(*words)
+    assert found.code == 4, found.err
+    assert f"coin/task.py: line 1 of code in a string: f: {IN_A_STRING[code]}" in found.err
+
+
+def test_error_in_a_thread_whose_code_is_from_a_string_is_one_line(coin, cli, tmp_path):
+    code = "def f(): 1 / 0\nt = threading.Thread(target=f); t.start(); t.join()"
+    after = f"import threading\nexec({code!r})"
+    (tmp_path / "coin" / "task.py").write_text(f"{COIN_TASK}\n{after}\n")
+    found = cli(*EVAL)
+    assert found.code == 0, found.err
+    assert "coin/task.py: line 1 of code in a string: error in a thread or destructor: ZeroDivisionError" in found.err
 
 
 def test_hook_that_breaks_a_library_in_a_worker_process_is_named(with_code, start):
@@ -309,6 +350,22 @@ def test_task_that_changes_the_current_folder_is_trained(with_code, start, tmp_p
     assert out == f"{run}\n"
     assert f"run {run}\n" in err
     assert json.loads((run / "run.json").read_text())["state"] == "finished"
+
+
+@pytest.mark.parametrize("hook", ["calculate_metrics", "reset_idx", "is_done"])
+def test_relative_paths_are_valid_if_a_hook_changes_the_current_folder(with_code, cli, start, hook):
+    """Each command runs hooks before it writes its file into the run or the current folder."""
+    assert cli(*TRAIN).code == 0
+    (run,) = Path("runs/coin").iterdir()
+    with_code(hook, "os.chdir('/')")
+    assert cli("report", run, "--no-video").code == 0
+    assert (run / "report.html").is_file()
+    assert cli("export", "--checkpoint", run, "--format", "bundle", "-o", "bundle").code == 0
+    assert Path("bundle/manifest.json").is_file()
+    assert cli("eval", "--checkpoint", run, "--episodes", "4", "--record", "episodes.npz").code == 0
+    assert Path("episodes.npz").is_file()
+    assert cli("runs").out.count("finished") == 1
+    assert Path.cwd() != Path("/")
 
 
 def test_recording_in_a_relative_path_is_written_if_a_hook_changes_the_current_folder(with_code, start):

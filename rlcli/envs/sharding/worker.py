@@ -116,7 +116,8 @@ def _serve(channel: Channel, arrays: int) -> None:
                 broken = copies.restore()
                 error = sys.exception()
                 assert error is not None
-                channel.send(ERROR, _PortableError.from_exception(error, broken))
+                lost = copies.error_of_lost_modules(error)
+                channel.send(ERROR, _PortableError.from_exception(error, broken, lost))
 
 
 class _Worker:
@@ -241,15 +242,19 @@ class _PortableError:
     trace: str
 
     @staticmethod
-    def from_exception(error: BaseException, broken: TaskError | None = None) -> _PortableError:
+    def from_exception(
+        error: BaseException, broken: TaskError | None = None, lost: TaskError | None = None
+    ) -> _PortableError:
         """Return the copy of an exception that a worker sends.
 
         An exception in the task's code becomes a TaskError that names the line of code. `broken` replaces an exception
-        that would be reported as a bug of rlcli: a task has broken built-in functions.
+        that would be reported as a bug of rlcli: a task has broken built-in functions. `lost` does this if no line of
+        the task's code is found that changes a module: a task has removed modules.
         """
         trace = "".join(traceback.format_exception(error))
         if not isinstance(error, RlcliError):
-            error = memory_error(error) or error_of_task(error) or broken or change_of_module(error) or error
+            known = memory_error(error) or error_of_task(error) or broken
+            error = known or change_of_module(error) or lost or error
         if isinstance(error, RlcliError):
             return _PortableError(type(error), error.args, dict(error.__dict__), trace)
         if type(error).__module__ == "builtins":
