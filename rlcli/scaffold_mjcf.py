@@ -122,12 +122,12 @@ class Robot:
                 return "balance", f"its base floats, but {without}, and only {driven} have one"
             return "velocity", f"its base floats, it has {_count(len(self.feet()), 'foot', 'feet')} and {joints}"
         if undriven:
-            return "balance", f"its base is fixed, but {without}"
+            return "balance", f"its base is fixed (no free joint), but {without}"
         if driven < 2:
-            return "balance", "its base is fixed, and it has only one driven joint; reaching needs 2"
+            return "balance", "its base is fixed (no free joint), and it has only one driven joint; reaching needs 2"
         if obstacle := self.obstacle_to("reach"):
             return "balance", obstacle
-        return "reach", f"its base is fixed, and all of its {driven} joints are driven"
+        return "reach", f"its base is fixed (no free joint), and all of its {driven} joints are driven"
 
     def obstacle_to(self, kind: str) -> str:
         """Return why a kind of task is impossible for the robot; empty if it is possible."""

@@ -198,8 +198,8 @@ def test_only_reaching_changes_the_usual_time_step(cli, tmp_path):
 def test_the_reason_for_the_kind_is_printed(cli, tmp_path):
     for text, kind, reason in (
         (DOG, "velocity", "its base floats, it has 4 feet and 4 driven joints"),
-        (CART, "balance", "its base is fixed, but 1 of its joints has no actuator of its own (hinge)"),
-        (ARM, "reach", "its base is fixed, and all of its 3 joints are driven"),
+        (CART, "balance", "its base is fixed (no free joint), but 1 of its joints has no actuator of its own (hinge)"),
+        (ARM, "reach", "its base is fixed (no free joint), and all of its 3 joints are driven"),
         (POINT.format(kind="hinge"), "balance", "its joints do not move its last body 'point' by more than 1 cm"),
         (UNICYCLE, "balance", "only 2 driven joints"),
         (DOG.replace("<worldbody>", '<option gravity="0 0 0"/><worldbody>'), "balance", "there is no gravity"),
