@@ -462,3 +462,12 @@ def test_joints_of_tendons_are_driven_if_they_are_as_many_as_joints_with_an_actu
         assert action["joints"] == driven
         assert cli("validate", "--deep", "my-robot/my_robot").code == 0
         shutil.rmtree(tmp_path / "my-robot")
+
+
+def test_servos_with_dynamics_are_replaced(cli, tmp_path):
+    filtered = 'dyntype="filter" dynprm="0.1" gainprm="50" biastype="affine" biasprm="0 -50"'
+    text = ARM.replace('<position joint="a" kp="20" forcerange="-9 9"/>', f'<general joint="a" {filtered}/>')
+    _, task = written(cli, tmp_path, text)
+    assert task["actions"]["joint_position"]["joints"] == ["a", "b", "c"]
+    assert task["scene"]["entities"]["robot"]["joints"].keys() == {"a", "b", "c"}
+    assert cli("validate", "--deep", "my-robot/my_robot").code == 0
