@@ -62,7 +62,7 @@ class Robot:
         home = default_pose(spec)
         self.has_pose = home is not None
         """Whether the file has a default pose. If not, joints are at zero, or beside zero where a limit is near it."""
-        pulled = remove_scene_elements(spec)
+        without_actuator = remove_scene_elements(spec)
         original = spec.compile()
         tree = ElementTree.fromstring(spec.to_xml())
         put_robot_first(tree, original)
@@ -106,7 +106,7 @@ class Robot:
         for pair in coupled_joints(model):  # coupled joints, such as two fingers: only one of the two is driven
             locked.add(next((j for j in pair[:2] if j not in self.actuator), -1))
         # without any actuator in the file, the task drives every joint that can move
-        drivable = {j for j in self.joints if j not in locked and (not model.nu or self.name(j) in pulled)}
+        drivable = {j for j in self.joints if j not in locked and (not model.nu or self.name(j) in without_actuator)}
         self.driven = [j for j in self.joints if j in self.actuator or j in drivable]
         # joints of other bodies, such as objects that the robot moves, are not passive joints of the robot
         own = {j for j in self.joints if model.body_rootid[model.jnt_bodyid[j]] == _ROOT}
@@ -136,12 +136,15 @@ class Robot:
             feet = _count(len(self.feet()), "foot", "feet")
             return "velocity", f"the robot's base floats, and it has {feet} and {joints}"
         if undriven:
-            return "balance", f"the robot's base is fixed, but {without}"
+            return "balance", f"the robot's base is fixed (no free joint), but {without}"
         if driven < 2:
-            return "balance", "the robot's base is fixed, and only one joint is driven, but reaching needs 2"
+            return (
+                "balance",
+                "the robot's base is fixed (no free joint), and only one joint is driven, but reaching needs 2",
+            )
         if obstacle := self.obstacle_to("reach"):
             return "balance", obstacle
-        return "reach", f"the robot's base is fixed, and all {driven} joints are driven"
+        return "reach", f"the robot's base is fixed (no free joint), and all {driven} joints are driven"
 
     def obstacle_to(self, kind: str) -> str:
         """Return why a kind of task (`velocity`, `reach`, `balance`) is impossible for the robot; empty if possible."""

@@ -12,6 +12,8 @@ from xml.etree import ElementTree
 import mujoco
 import numpy as np
 
+from rlcli.scene.joint_and_actuator_setup import actuator_kind
+
 SCALAR = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 """Joint types with one position: hinge and slide."""
 FREE = int(mujoco.mjtJoint.mjJNT_FREE)
@@ -37,13 +39,14 @@ def remove_scene_elements(spec: mujoco.MjSpec) -> list[str]:
 
     Equalities (weld, connect) with mocap bodies are removed, too: a task does not move mocap bodies, so the equalities
     would hold the robot. If as many joints are pulled by tendons as have an actuator of their own, the actuators of
-    tendons and their sensors are removed, and the task drives these joints directly. `spec` is changed in place.
+    tendons and their sensors are removed. So are servos with dynamics of their own, such as a filter. The task drives
+    these joints directly. `spec` is changed in place.
 
     Returns:
-        Names of the joints whose tendons have lost their actuators. The list is empty if the robot has no other
-        actuator: then the task drives all joints.
+        Names of the joints that have lost their actuators. The list is empty if the robot has no other actuator: then
+        the task drives all joints.
     """
-    pulled = _replace_tendon_actuators(spec)
+    lost = [*_remove_tendon_actuators(spec), *_remove_unknown_servos(spec)]
     for key in list(spec.keys):
         spec.delete(key)
     mocap = {body.name for body in spec.bodies if body.mocap}
@@ -63,10 +66,10 @@ def remove_scene_elements(spec: mujoco.MjSpec) -> list[str]:
             if not element.name:
                 element.name = next(n for i in range(number, 10**6) if (n := f"{kind}{i}") not in taken)
                 taken.add(element.name)
-    return [joint.name for joint in pulled] if len(spec.actuators) else []
+    return [joint.name for joint in lost] if len(spec.actuators) else []
 
 
-def _replace_tendon_actuators(spec: mujoco.MjSpec) -> list[mujoco.MjsJoint]:
+def _remove_tendon_actuators(spec: mujoco.MjSpec) -> list[mujoco.MjsJoint]:
     """Remove the actuators of tendons if these pull at many joints; return the joints."""
     own = {a.target for a in spec.actuators if a.trntype == mujoco.mjtTrn.mjTRN_JOINT}
     tendons = [a for a in spec.actuators if a.trntype == mujoco.mjtTrn.mjTRN_TENDON]
@@ -75,13 +78,36 @@ def _replace_tendon_actuators(spec: mujoco.MjSpec) -> list[mujoco.MjsJoint]:
     pulled = [joint for name, joint in found.items() if name not in own]
     if len(pulled) < len(own):
         return []
-    removed = {actuator.name for actuator in tendons}
+    _remove_actuators(spec, tendons)
+    return pulled
+
+
+def _remove_unknown_servos(spec: mujoco.MjSpec) -> list[mujoco.MjsJoint]:
+    """Remove servos of joints whose kind the actions do not know; return the joints.
+
+    An action would drive the joint by a further actuator, against the servo, which holds the joint at zero.
+    """
+    joints = {joint.name: joint for joint in spec.joints}
+    servos = [
+        actuator
+        for actuator in spec.actuators
+        if actuator.trntype == mujoco.mjtTrn.mjTRN_JOINT
+        and actuator.biasprm[1] != 0.0
+        and actuator_kind(actuator) == "other"
+    ]
+    lost = [joints[actuator.target] for actuator in servos]
+    _remove_actuators(spec, servos)
+    return lost
+
+
+def _remove_actuators(spec: mujoco.MjSpec, actuators: list[mujoco.MjsActuator]) -> None:
+    """Remove actuators, and the sensors that measure them."""
+    removed = {actuator.name for actuator in actuators}
     for sensor in list(spec.sensors):
         if sensor.objtype == mujoco.mjtObj.mjOBJ_ACTUATOR and sensor.objname in removed:
             spec.delete(sensor)
-    for actuator in tendons:
+    for actuator in actuators:
         spec.delete(actuator)
-    return pulled
 
 
 def put_robot_first(tree: ElementTree.Element, model: mujoco.MjModel) -> None:

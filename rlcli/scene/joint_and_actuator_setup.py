@@ -124,7 +124,7 @@ class SceneJoints:
                 continue
             if change.effort_limit is not None:
                 _limit_effort(actuator, change.effort_limit)
-            kind = _actuator_kind(actuator)
+            kind = actuator_kind(actuator)
             if kind == "position" and change.kp is not None:
                 actuator.gainprm[0], actuator.biasprm[1] = change.kp, -change.kp
             if kind == "velocity" and change.kv is not None:
@@ -134,7 +134,7 @@ class SceneJoints:
 
     def _add_actuator(self, entity: str, joint: str, kind: str) -> None:
         target = f"{entity}/{joint}"
-        if any(a.target == target and _actuator_kind(a) == kind for a in self._spec.actuators):
+        if any(a.target == target and actuator_kind(a) == kind for a in self._spec.actuators):
             return
         settings = joint_settings(self._entities[entity], joint)
         used_names = {actuator.name for actuator in self._spec.actuators}
@@ -174,10 +174,10 @@ def joint_settings(entity: EntityConfig, joint: str) -> JointConfig:
 
 def model_actuator_kind(model: mujoco.MjModel, actuator: int) -> str:
     """Return the kind of an actuator of a compiled model: motor, position, velocity or other."""
-    return _actuator_kind(model.actuator(actuator))
+    return actuator_kind(model.actuator(actuator))
 
 
-def _actuator_kind(actuator: Any) -> str:
+def actuator_kind(actuator: Any) -> str:
     """Return the kind of an actuator of an MjSpec or of a compiled model: motor, position, velocity or other."""
     kinds = (actuator.trntype, actuator.dyntype, actuator.gaintype, actuator.biastype)
     # in a compiled model these are arrays of one element

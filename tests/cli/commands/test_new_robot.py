@@ -198,8 +198,12 @@ def test_only_reaching_changes_the_usual_time_step(cli, tmp_path):
 def test_the_reason_for_the_kind_is_printed(cli, tmp_path):
     for text, kind, reason in (
         (DOG, "velocity", "the robot's base floats, and it has 4 feet and 4 driven joints"),
-        (CART, "balance", "the robot's base is fixed, but 1 of its joints has no actuator of its own (hinge)"),
-        (ARM, "reach", "the robot's base is fixed, and all 3 joints are driven"),
+        (
+            CART,
+            "balance",
+            "the robot's base is fixed (no free joint), but 1 of its joints has no actuator of its own (hinge)",
+        ),
+        (ARM, "reach", "the robot's base is fixed (no free joint), and all 3 joints are driven"),
         (POINT.format(kind="hinge"), "balance", "the joints do not move the last body 'point' by more than 1 cm"),
         (UNICYCLE, "balance", "only 2 driven joints"),
         (DOG.replace("<worldbody>", '<option gravity="0 0 0"/><worldbody>'), "balance", "the file sets gravity to 0"),
@@ -462,3 +466,12 @@ def test_joints_of_tendons_are_driven_if_they_are_as_many_as_joints_with_an_actu
         assert action["joints"] == driven
         assert cli("validate", "--deep", "my-robot/my_robot").code == 0
         shutil.rmtree(tmp_path / "my-robot")
+
+
+def test_servos_with_dynamics_are_replaced(cli, tmp_path):
+    filtered = 'dyntype="filter" dynprm="0.1" gainprm="50" biastype="affine" biasprm="0 -50"'
+    text = ARM.replace('<position joint="a" kp="20" forcerange="-9 9"/>', f'<general joint="a" {filtered}/>')
+    _, task = written(cli, tmp_path, text)
+    assert task["actions"]["joint_position"]["joints"] == ["a", "b", "c"]
+    assert task["scene"]["entities"]["robot"]["joints"].keys() == {"a", "b", "c"}
+    assert cli("validate", "--deep", "my-robot/my_robot").code == 0
