@@ -77,8 +77,14 @@ def recorded_task(
         return folder_task(Path(str(record["folder"])), file)
     except TaskError as error:
         version = f" {record['version']}" if record.get("version") else ""
-        folder = "" if run is None else f"; or name its folder: rlcli play FOLDER --checkpoint {shlex.quote(run)}"
-        hint = f"if you trust its authors, install {owner}{version}{folder}" if owner else error.hint
+        run_word = shlex.quote(run or "")
+        folder = "" if run is None else f"; or name its folder: rlcli play FOLDER --checkpoint {run_word}"
+        place = shlex.quote(f"PATH/{Path(str(record.get('python') or record.get('folder'))).name}")
+        moved = (
+            "" if run is None else f"if it was moved, name its new place: rlcli eval {place} --checkpoint {run_word}"
+        )
+        known = "; ".join(filter(None, (error.hint, moved))) or None
+        hint = f"if you trust its authors, install {owner}{version}{folder}" if owner else known
         raise TaskError(f"{what} is not installed: {error.message}", hint=hint) from None
 
 
