@@ -68,10 +68,14 @@ def recorded_task(
         return folder_task(Path(str(record["folder"])), file)
     except TaskError as error:
         version = f" {record['version']}" if record.get("version") else ""
-        folder = (
-            "" if run is None else f"; or name the task's folder: rlcli play FOLDER --checkpoint {shlex.quote(run)}"
-        )
-        hint = f"if you trust its authors, install {owner}{version}{folder}" if owner else error.hint
+        known = error.hint
+        if run is not None:
+            word, path = shlex.quote(run), Path(str(record.get("python") or record.get("folder")))
+            version += f"; or name the task's folder: rlcli play FOLDER --checkpoint {word}"
+            moved = shlex.quote(f"PATH/{path.name}")
+            known = f"{error.hint}; " if error.hint else ""
+            known += f"if the task was moved, name its new place: rlcli eval {moved} --checkpoint {word}"
+        hint = f"if you trust its authors, install {owner}{version}" if owner else known
         raise TaskError(f"{what} is not installed: {error.message}", hint=hint) from None
 
 

@@ -10,6 +10,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from rlcli.errors import listing
 from rlcli_isaaclab.settings import Node, Report, as_float, kind_of, to_plain
 from rlcli_isaaclab.user_actuators import is_user_actuator
 
@@ -203,20 +204,21 @@ def _merge(
         report: receives what is approximated.
     """
     by_joint: dict[str, dict[str, Any]] = {}
-    kept = 0.0
+    kept: dict[str, float] = {}
     for joint in model["joint"]:
         values = settings_of(joint, settings)
         has_actuator = joint in driven or joint in model["driven"]
         key = ("scene", name, "actuators", joint)
         values = _joint_config(values, driven.get(joint, ""), has_actuator, key, report)
         if joint in driven and "damping" not in values:
-            kept = max(kept, model["damping"][joint])
+            kept |= {joint: model["damping"][joint]} if model["damping"][joint] else {}
         for item in ("damping", "armature", "friction_loss"):
             if item in values and model[item][joint] == values[item]:
                 del values[item]
         by_joint[joint] = {key: values[key] for key in sorted(values, key=_rank)}
     if kept:
-        why = f"the damping of the MJCF's joints, at most {kept:g}, acts in addition"
+        which = listing(sorted(kept), 6)
+        why = f"the damping of the MJCF's joints, at most {max(kept.values()):g}, acts in addition: {which}"
         report.entries["scene", name, "actuators", "damping"] = ("approximated", why)
     joints: dict[str, Any] = {}
     for pattern in dict.fromkeys([*(pattern for pattern, _, _ in settings), *map(re.escape, by_joint)]):

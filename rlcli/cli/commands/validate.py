@@ -45,10 +45,11 @@ def command(
 
         small = resolve(source, agent=agent, config_file=config, overrides=words, flags={"scene.num_envs": 2})
         make_env(small).reset(seed=0)
+    missing = missing_models(resolved)
     log_notes(resolved.notes)
     shown = target if source.python is not None and source.distribution is None else source.label
     console.data(f"{shown}: valid ({'files and model' if deep else 'files'})")
-    for sentence in missing_models(resolved):
+    for sentence in missing:
         console.warn(f"model of {sentence}")
     if unchecked:
         names = ", ".join(unchecked)

@@ -88,6 +88,12 @@ def test_mistake_in_config_file_names_file(in_process, here):
     assert "mine.yaml:1:19: rewards.alive.weight: expected a number, found 'x'" in err
 
 
+def test_validate_refuses_a_model_outside_of_the_folder_before_it_prints_a_result(in_process, small):
+    code, out, err = in_process("validate", small(("model: model.xml", "model: ../model.xml")))
+    assert (code, out) == (3, "")
+    assert "small/task.yaml:8:13: scene.entities.robot.model: '../model.xml' lies outside the task's folder" in err
+
+
 def test_validate_reports_missing_model(in_process, here, small):
     code, _, err = in_process("validate", small(("model.xml", "models.xml")))
     assert code == 3

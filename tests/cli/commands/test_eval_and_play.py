@@ -373,10 +373,13 @@ def test_run_keeps_its_configuration_when_task_changes(cli, coin):
 
 def test_run_with_missing_task_folder_names_it(cli, coin):
     cli("train", coin, *SMALL, "--max-iterations", 1)
-    Path("coin").rename("moved")
+    Path("elsewhere").mkdir()
+    Path("coin").rename("elsewhere/coin")
     done = cli("eval", "--checkpoint", "latest")
     assert done.code == 4
-    assert "coin" in done.err
+    (run,) = Path("runs").glob("coin/*")
+    assert f"hint: if it was moved, name its new place: rlcli eval PATH/coin --checkpoint {run}" in done.err
+    assert cli("eval", "elsewhere/coin", "--checkpoint", run, "--episodes", 2).code == 0
 
 
 def test_run_with_missing_distribution_names_it(cli, trained):
