@@ -378,7 +378,7 @@ def test_run_with_missing_task_folder_names_it(cli, coin):
     done = cli("eval", "--checkpoint", "latest")
     assert done.code == 4
     (run,) = Path("runs").glob("coin/*")
-    assert f"hint: if it was moved, name its new place: rlcli eval PATH/coin --checkpoint {run}" in done.err
+    assert f"hint: if the task was moved, name its new place: rlcli eval PATH/coin --checkpoint {run}" in done.err
     assert cli("eval", "elsewhere/coin", "--checkpoint", run, "--episodes", 2).code == 0
 
 
