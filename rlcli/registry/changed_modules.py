@@ -111,7 +111,7 @@ def _is_no_module(value: object) -> bool:
 
 def _entry(module: object, name: str) -> object:
     """Return a value of a module's namespace, or None, without an import that the module delays."""
-    return ModuleType.__getattribute__(module, "__dict__").get(name)  # type: ignore[arg-type]
+    return ModuleType.__getattribute__(module, "__dict__").get(name)
 
 
 def change_of_module(error: BaseException) -> TaskError | None:
@@ -167,13 +167,13 @@ def _changes_in(tree: ast.Module) -> Iterator[tuple[int, str]]:
     """
     imported = {"__builtins__": "builtins"}
     imports = [node for node in ast.walk(tree) if isinstance(node, ast.Import | ast.ImportFrom)]
-    for node in imports:
-        if isinstance(node, ast.Import):
-            for each in node.names:
+    for statement in imports:
+        if isinstance(statement, ast.Import):
+            for each in statement.names:
                 top = each.name.partition(".")[0]
                 imported[each.asname or top] = each.name if each.asname else top
-        elif node.module and not node.level:
-            imported |= {each.asname or each.name: f"{node.module}.{each.name}" for each in node.names}
+        elif statement.module and not statement.level:
+            imported |= {each.asname or each.name: f"{statement.module}.{each.name}" for each in statement.names}
     imported = {name: module for name, module in imported.items() if not _is_of_task(module.partition(".")[0])}
     for node in ast.walk(tree):
         for target in _changed_expressions(node):
