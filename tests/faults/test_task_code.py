@@ -240,7 +240,7 @@ CHANGES = {
     "setattr(threading.Thread, 'start', None)": "threading.Thread.start",
     "sys.modules.clear()": "sys.modules",
     "sys.modules.update(dict.fromkeys(sys.modules))": "sys.modules",
-    "sys.modules.update({name: 3 for name in sys.modules})": "sys.modules",
+    "sys.modules.update({name: 3 for name in sys.modules if name != 'sys'})": "sys.modules",
     "exec('torch.zeros = torch.ones = None')": "torch.ones",
 }
 

@@ -27,7 +27,9 @@ ONLY_TESTED_WITH = {"psycopg", "psycopg-binary"}
 def script(name):
     spec = importlib.util.spec_from_file_location(name, REPOSITORY / "docs" / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(REPOSITORY / "docs")  # as for `python docs/NAME.py`
+        spec.loader.exec_module(module)
     return module
 
 

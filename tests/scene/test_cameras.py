@@ -277,7 +277,7 @@ def test_gpu_engine_refuses_cameras(boxes):
         ({"entity": "car"}, "no entity 'car' in the scene"),
         ({"camera": "ahead"}, "need the key entity: set it"),
         ({"entity": "robot", "camera": "ahead", "fov": 30.0}, "has its own position and field of view: remove fov"),
-        ({"clip": [2.0, 1.0]}, "2 is not below 1"),
+        ({"clip": [2.0, 1.0]}, "near, 2, is not below far, 1"),
         ({"eye": [1, 0, 1]}, "eye and lookat are the same point"),
         ({"data": "colour"}, "data"),
     ],

@@ -12,6 +12,8 @@ from xml.etree import ElementTree
 
 import mujoco
 
+sys.path.append(str(Path(__file__).parents[1]))  # a process of its own runs this file
+
 from rlcli.errors import Problem, one_line
 from rlcli.scene.mjcf_safety_check import BadModel
 from rlcli.scene.untrusted_mjcf import read_mjcf

@@ -52,10 +52,7 @@ def command(
         for remedy in dict.fromkeys(known.remedy for _, known in rows if known.broken and known.remedy):
             console.info(f"for a broken task: {remedy}")
         if any(known.broken for _, known in rows) and not probe_all:
-            console.info(
-                "the column STATUS is from the last time each task was loaded; after a repair, load the tasks again:"
-                " rlcli list-tasks --probe"
-            )
+            console.info("STATUS is from each task's last load; after a repair, load again: rlcli list-tasks --probe")
     else:
         near = did_you_mean(pattern.lower(), by_name)
         console.info(f"no task's name or summary contains '{pattern}'; {near or 'rlcli list-tasks shows all'}")
