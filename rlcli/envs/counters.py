@@ -72,7 +72,10 @@ class SuccessCondition:
 
 
 class EpisodeCounters(TensorState):
-    """Counters of steps and episodes of all environments; `*_field` attributes share the tensors' memory."""
+    """Counters of steps and episodes of a shard's environments.
+
+    The attributes `*_field` are views of the tensors, for fast writes.
+    """
 
     def __init__(self, shard: Shard, device: torch.device) -> None:
         num_envs = shard.count

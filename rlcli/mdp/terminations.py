@@ -12,7 +12,10 @@ from rlcli.task import Joints, Range
 
 
 def time_out(env: ManagedEnv) -> Tensor:
-    """End the episode when it has lasted `episode_length_s`. Declare it with `time_out: true`. (num_envs,)"""
+    """End the episode when it has lasted `episode_length_s`. (num_envs,)
+
+    Declare the term with `time_out: true`, so that the episode is truncated, not terminated.
+    """
     return env.episode_length_buf >= env.max_episode_length
 
 
@@ -57,10 +60,10 @@ def joint_vel_out_of_limit(env: ManagedEnv, *, entity: Entity = "robot", joints:
 
 
 def joint_effort_out_of_limit(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
-    """End the episode if the command of any actuator exceeds its effort limit. (num_envs,)
+    """End the episode if the effort of any actuator would exceed its limit without the limit. (num_envs,)
 
-    The command of MuJoCo's own actuators follows from the present state and controls. Isaac Lab: explicit actuators
-    only, with values of the last substep.
+    For MuJoCo's own actuators, this effort is computed from the present state and controls. Isaac Lab checks actuator
+    models only (its explicit actuators), with values of the last physics step.
     """
     return any_column(entity.data.withheld_effort[:, joints] > 0.0)
 

@@ -146,7 +146,7 @@ class FailureRecorder(StepObserver):
         return min(self._slots, self._engine.history.calls // self._env.calls_per_step) * self._env.step_dt
 
     def close(self) -> None:
-        """Stop recording, and set the engine to keep only its newest call."""
+        """Stop recording; if nothing else observes divergences, set the engine to keep only its newest call."""
         stop_observing_divergences(self._env, self)
 
     # --- called after iterations and at checkpoints ---

@@ -68,7 +68,10 @@ class Ground:
 
 
 def terrain_problems(config: TerrainConfig, root: Path) -> Iterator[TerrainProblem]:
-    """Yield the mistakes in a terrain's configuration; `root` is the task's folder, to which `file` is relative."""
+    """Yield the mistakes in a terrain's configuration.
+
+    `root` is the task's folder, to which the path in the terrain's key `file` is relative.
+    """
     if isinstance(config, schema.TerrainHeightsConfig):
         yield from _file_problems(config, root)
         return

@@ -211,7 +211,11 @@ class Data:
 
     @property
     def root_com_state_w(self) -> Tensor:
-        """Centre of mass of the root, its principal axes and its velocity, world frame. (num_envs, 13)"""
+        """Pose and velocity of the root's centre of mass, world frame. (num_envs, 13)
+
+        Columns: position [m], quaternion of the root's principal axes (w, x, y, z), linear [m/s] and angular velocity
+        [rad/s].
+        """
         return self.body_com_state_w[:, 0]
 
     @property

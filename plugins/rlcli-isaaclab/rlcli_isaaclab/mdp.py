@@ -1,7 +1,7 @@
-"""Terms and actions under Isaac Lab's names: every term of `rlcli.mdp` that has a counterpart there.
+"""Replacement of Isaac Lab's `mdp`: functions for terms, and configuration classes of actions and commands.
 
-In a configuration such a function stands for the built-in term. The user's own terms may also call it:
-`mdp.joint_pos_rel(env, asset_cfg)` returns the value of the built-in term.
+In a configuration, a function stands for rlcli's built-in term, or for a copy of Isaac Lab's term in `lab_terms`. The
+user's own terms may also call the function: `mdp.joint_pos_rel(env, asset_cfg)` returns the value of the term.
 """
 
 from __future__ import annotations

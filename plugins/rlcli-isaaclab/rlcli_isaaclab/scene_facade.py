@@ -138,7 +138,9 @@ class Asset:
         if name.startswith("__"):
             raise AttributeError(name)
         if name.startswith("_"):
-            raise MissingMemberError(f"an asset of rlcli has no '{name}'", _OWN_CLASS)
+            raise MissingMemberError(
+                f"an asset of rlcli has no private attribute '{name}'; use public attributes", _OWN_CLASS
+            )
         known = [n for n in (*dir(type(self)), *vars(self)) if not n.startswith("_")]
         hint = did_you_mean(name, known) or f"attributes: {listing(known, 40)}"
         if "physx" in name and not did_you_mean(name, known):

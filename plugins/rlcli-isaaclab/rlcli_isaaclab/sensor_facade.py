@@ -246,7 +246,10 @@ class Sensor:
 
     @property
     def force_matrix_w(self) -> Tensor | None:
-        """Contact force between each body and each filtered body, world frame. (num_envs, bodies, filters, 3) [N]"""
+        """Contact force on each body from each entry of `filter_prim_paths_expr`, world frame; None without entries.
+
+        Shape: (num_envs, bodies, entries, 3) [N].
+        """
         return torch.stack([part._sensor.force for part in self.filters], dim=2) if self.filters else None
 
     def bind(self, sensor: Any) -> None:

@@ -393,9 +393,9 @@ class TermReader(ObjectReader):
     def _user_term(
         self, function: Any, section: str, entities: frozenset[str], names: tuple[str, ...], objects: dict[str, Any]
     ) -> Any:
-        """Return the `UserTerm` that runs a function; without `objects`, equal arguments give the same object.
+        """Return the `UserTerm` that runs a function. Without `objects`, equal arguments give the same `UserTerm`.
 
-        The arguments are those of `UserTerm`.
+        `names` is the argument `extra` of `UserTerm`; the others have the same names.
         """
         from rlcli_isaaclab.terms import UserTerm
 

@@ -101,7 +101,7 @@ def test_methods_of_an_own_asset_class_are_named_and_a_term_that_needs_them_stop
     assert "scene.robot: rlcli does not run the method update of the class Remembers" in note.text
     assert note.text.split(": read as")[0].startswith("read as a Articulation; ")
     assert "rover_env.py:" in next(record.getMessage() for record in caplog.records)
-    with pytest.raises(AttributeError, match="an asset of rlcli has no '_last'") as found:
+    with pytest.raises(AttributeError, match="no private attribute '_last'") as found:
         stepped(resolved)
     error = error_of_task(found.value)
     assert isinstance(error, TaskError)

@@ -9,7 +9,10 @@ from typing import Any
 
 
 def generic_io_descriptor(function: Any = None, **settings: Any) -> Any:
-    """Return the function itself: descriptions of observations are not exported."""
+    """Decorator of Isaac Lab without effect: rlcli does not export descriptions of terms.
+
+    Called with settings only, the function returns a decorator.
+    """
     return function if callable(function) else lambda wrapped: wrapped
 
 
