@@ -9,7 +9,7 @@ from typing import Any
 
 
 def generic_io_descriptor(function: Any = None, **settings: Any) -> Any:
-    """Decorator of Isaac Lab without effect: rlcli does not export descriptions of terms.
+    """Return the function itself: rlcli does not export descriptions of terms.
 
     Called with settings only, the function returns a decorator.
     """
