@@ -67,7 +67,7 @@ def _follow(run: Run) -> Overview:
             try:
                 run = open_run(run.folder)
             except CheckpointError:
-                if not run.folder.exists():  # rlcli removes the folder of a run that fails in its first iteration
+                if not run.folder.exists():  # rlcli removes the folder of a run whose setup fails
                     raise
         return overview_of(open_run(run.folder))
 
