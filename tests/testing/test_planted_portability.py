@@ -196,6 +196,32 @@ class Turn:
     assert "asked" in finding.where
 
 
+def test_checkpoint_finds_unsaved_mask_of_first_steps(managed):
+    """After some steps the mask is true in every environment, before and after restoring."""
+    managed.terms = """
+class Jump:
+    def __init__(self, env) -> None:
+        self.started = torch.zeros(env.num_envs, dtype=torch.bool)
+
+    def __call__(self):
+        value = self.started.float()
+        self.started[:] = True
+        return value
+
+    def reset(self, selection) -> None:
+        selection.write(self.started, False)
+
+    def state_dict(self):
+        return {}
+
+    def load_state_dict(self, state) -> None:
+        pass
+"""
+    managed.config["rewards"]["jump"] = {"func": "jump", "weight": 1.0}
+    ((finding,), _) = only(managed, "checkpoint")
+    assert finding.where == "reward"
+
+
 def test_checkpoint_finds_iterator_but_accepts_number(direct):
     direct.replace(
         "        self.rew_buf[:] = ",
