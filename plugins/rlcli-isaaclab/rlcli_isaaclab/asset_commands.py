@@ -31,6 +31,7 @@ class JointDrive:
         self._undriven = [c for c in range(count) if c not in self._columns] if kind != "position" else []
         self._name, self._kind, self._joints = entity.name, kind, list(entity.joint_names)
         self._command = JointCommand(entity, kind, self._columns) if self._columns else None
+        self._env, self._entity, self._knows_actions = env, entity, False
         self.target = torch.zeros(env.num_envs, count, device=env.device)
         if kind == "position":
             self.target.copy_(entity.data.default_joint_pos)
@@ -62,8 +63,20 @@ class JointDrive:
                 f" {listing(self._joints[self._undriven[i]] for i in wrong)}",
                 hint="add actuators of this kind to the MJCF",
             )
+        if not self._knows_actions and hasattr(self._env, "action_manager"):
+            self._leave_out_driven()
         if self._command is not None:
             self._command.write(self.target[:, self._columns])
+
+    def _leave_out_driven(self) -> None:
+        """Leave the joints out that a built-in action of rlcli drives: it writes the targets of its joints itself."""
+        self._knows_actions = True
+        driven = {sink for term in self._env.action_manager.terms for sink in getattr(term.instance, "sinks", ())}
+        sinks = [] if self._command is None else self._command.sinks
+        free = [column for column, sink in zip(self._columns, sinks, strict=True) if sink not in driven]
+        if free != self._columns:
+            self._columns = free
+            self._command = JointCommand(self._entity, self._kind, free) if free else None
 
 
 class BodyWrench:

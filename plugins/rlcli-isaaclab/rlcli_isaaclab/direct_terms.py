@@ -78,7 +78,7 @@ class DirectRunner:
         self.observation_noise = noise_model(cfg.observation_noise_model, managed)
         facade_of(managed).extras = self.lab.extras  # events of the configuration get this object as `env`
         managed.task_log = self.log = ExtrasLog(lambda: self.lab.extras, _OWN_METRICS)
-        self._memory = AttributeState(self.lab, excluded=("cfg", "managed", "sim", "scene"))
+        self._memory = AttributeState(self.lab, excluded=("cfg", "managed", "sim", "scene", "rlcli_fire_resets"))
         self._observed: dict[str, Tensor] = {}
 
     def apply(self) -> None:
@@ -115,7 +115,12 @@ class DirectRunner:
         """Call `_reset_idx` for the selected environments, and reset the noise models there."""
         ids = selection.env_ids()
         if len(ids):
-            self.log.call_reset(lambda: self.lab._reset_idx(ids))
+            events, step = self.managed.event_manager, self.managed._counters.common_step
+            self.lab.rlcli_fire_resets = lambda: events.fire_resets(selection, step)
+            try:
+                self.log.call_reset(lambda: self.lab._reset_idx(ids))
+            finally:
+                self.lab.rlcli_fire_resets = None
             self.observation_noise.reset(ids)
             self.action_noise.reset(ids)
         self.phase = "reset"
@@ -217,6 +222,9 @@ class _Reward(_Hook):
 
 
 class _Reset(_Hook):
+    fires_resets = True
+    """The other reset events run when `_reset_idx` of the task calls that of `DirectRLEnv`."""
+
     def __call__(self, selection: Selection) -> None:
         self._runner.reset_envs(selection)
 
