@@ -33,19 +33,27 @@ def keeps_state(events: Mapping[str, Mapping[str, Any]], scene: SceneReader, ent
         scene: the scene, with the joints of each entity.
         entities: the entities of rlcli's scene, by name.
     """
+    from rlcli.scene.names import search
+
     resets = [event for event in events.values() if event.get("mode") == "reset"]
     if any(event["func"] not in builtin_terms("events") for event in resets):
         return True
     always = [event for event in resets if not event.get("min_steps_between")]
     if any(event["func"] == "reset_scene_to_default" for event in always):
         return False
-    whole = [(e["func"], e.get("entity", "robot")) for e in always if e.get("joints", ".*") in (".*", [".*"])]
-    return any(
-        (scene.names(name, "joint") and not any((func, name) in whole for func in _OF_JOINTS))
-        or (not scene.is_fixed(name) and not any((func, name) in whole for func in _OF_ROOT))
-        for name in entities
-        if scene.names(name, "body")
-    )
+    for name in entities:
+        written: set[int] = set()
+        moves_root = scene.is_fixed(name)
+        joints = scene.names(name, "joint") or []
+        for event in always:
+            if event.get("entity", "robot") == name:
+                moves_root |= event["func"] in _OF_ROOT
+                selected = event.get("joints", ".*") if event["func"] in _OF_JOINTS else []
+                for pattern in [selected] if isinstance(selected, str) else selected:
+                    written.update(search(pattern, joints, "joint"))
+        if scene.names(name, "body") and (len(written) < len(joints) or not moves_root):
+            return True
+    return False
 
 
 def note_episode_lengths(env_class: type, report: Report) -> None:

@@ -7,7 +7,9 @@ import torch
 from test_isaaclab_silent_differences import pole as pole
 from test_isaaclab_user_code import rover
 
+from rlcli.config.load import resolve
 from rlcli.envs.make import make_env
+from rlcli.registry import find_task
 from rlcli_isaaclab.runtime import facade_of
 
 torch.set_num_threads(1)
@@ -236,7 +238,8 @@ def test_own_reset_event_reads_the_last_state_and_what_no_event_writes_stays(tmp
         (["reset_joints_by_offset", "reset_root_state_uniform"], False),
         (["reset_joints_by_offset"], True),
         (["reset_root_state_uniform"], True),
-        (["reset_joints_by_offset, arm only", "reset_root_state_uniform"], True),
+        (["reset_joints_by_offset, arm", "reset_root_state_uniform"], True),
+        (["reset_joints_by_offset, arm", "reset_joints_by_offset, wheel", "reset_root_state_uniform"], False),
         ([], True),
     ],
 )
@@ -248,10 +251,10 @@ def test_state_is_kept_if_events_do_not_write_all_of_it(tmp_path, events, kept):
     }
     terms = {}
     for number, event in enumerate(events):
-        name, _, arm = event.partition(",")
+        name, _, joint = event.partition(", ")
         params = ranges[name]
-        if arm:
-            params = params.replace("}", ", 'asset_cfg': SceneEntityCfg('robot', joint_names=['arm'])}")
+        if joint:
+            params = params.replace("}", f", 'asset_cfg': SceneEntityCfg('robot', joint_names=['{joint}'])}}")
         terms[f"e{number}"] = f"EventTermCfg(func=mdp.{name}, mode='reset', params={params})"
     resolved = rover(tmp_path / "rover", events=terms)
     assert resolved.task.keep_state_at_reset is kept
@@ -261,6 +264,10 @@ def test_state_is_kept_if_events_do_not_write_all_of_it(tmp_path, events, kept):
     stepped(env, 1, 0.4)
     wheel = env.entities["robot"].data.joint_pos[:, 1]
     assert (wheel.abs() > 0.02).all() == (kept and "reset_joints_by_offset" not in events)
+
+
+def test_state_is_not_kept_if_several_events_write_all_of_it(package):
+    assert not resolve(find_task(str(package()))).task.keep_state_at_reset
 
 
 # direct tasks
