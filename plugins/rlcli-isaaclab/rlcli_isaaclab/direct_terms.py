@@ -24,7 +24,7 @@ from rlcli_isaaclab.runtime import facade_of
 from rlcli_isaaclab.substeps import Substeps
 from rlcli_isaaclab.task_fields import set_own_fields
 from rlcli_isaaclab.user_files import adapt_to_device
-from rlcli_isaaclab.utils.buffers import call_without_effects
+from rlcli_isaaclab.utils.buffers import call_without_effects, set_tensors, tensors_of
 
 _OWN_METRICS = ("Episode_Reward/reward", "Episode_Termination/terminated", "Episode_Termination/time_out")
 """Metrics that rlcli computes for each direct task."""
@@ -88,13 +88,23 @@ class DirectRunner:
             asset.apply_wrenches()
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return copies of the task's tensors."""
-        return dict(self._memory.state_dict())
+        """Return copies of the tensors of the task and of its noise models."""
+        state = dict(self._memory.state_dict())
+        for name, model in self._noise_models().items():
+            state |= {f"{name}.{path}": value.clone() for path, value in tensors_of(model).items()}
+        return state
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Restore the tensors returned by `state_dict`."""
-        self._memory.load_state_dict(state)
+        for name, model in self._noise_models().items():
+            start = f"{name}."
+            set_tensors(model, {p.removeprefix(start): v for p, v in state.items() if p.startswith(start)})
+        names = tuple(f"{name}." for name in self._noise_models())
+        self._memory.load_state_dict({path: value for path, value in state.items() if not path.startswith(names)})
         self.phase = "restored"
+
+    def _noise_models(self) -> dict[str, Any]:
+        return {"rlcli_action_noise": self.action_noise, "rlcli_observation_noise": self.observation_noise}
 
     def process(self, action: Tensor) -> None:
         """Call `_pre_physics_step` with the action and its noise, and `_apply_action` in the next physics steps."""

@@ -332,3 +332,22 @@ def test_step_of_a_direct_tasks_own_class_is_reported(pole, caplog):
         notes = pole(("    def _get_rewards(self):", own)).notes
     assert "rlcli does not run the method step of the class PoleEnv" in caplog.text
     assert [note.key for note in notes if note.key == "env_class"]
+
+
+NOISE = """
+    observation_noise_model = NoiseModelWithAdditiveBiasCfg(
+        noise_cfg=GaussianNoiseCfg(std=0.0), bias_noise_cfg=GaussianNoiseCfg(std=0.5, operation="abs"))
+"""
+
+
+def test_saved_state_of_a_direct_task_has_the_biases_of_its_noise(pole):
+    head = "from isaaclab.utils.noise import GaussianNoiseCfg, NoiseModelWithAdditiveBiasCfg\n"
+    resolved = pole((CLASS, head + CLASS + NOISE))
+    env = started(resolved)
+    stepped(env, 3)
+    state = env.state_dict()
+    expected = stepped(env, 1).obs["policy"]
+    other = started(resolved)
+    other.load_state_dict(state)
+    assert torch.equal(stepped(other, 1).obs["policy"], expected)
+    assert expected[:, 0].abs().min() > 1e-3
