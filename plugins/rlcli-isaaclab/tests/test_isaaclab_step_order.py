@@ -351,3 +351,15 @@ def test_saved_state_of_a_direct_task_has_the_biases_of_its_noise(pole):
     other.load_state_dict(state)
     assert torch.equal(stepped(other, 1).obs["policy"], expected)
     assert expected[:, 0].abs().min() > 1e-3
+
+
+def test_target_of_a_joint_that_another_action_drives_is_reported(tmp_path, caplog):
+    both = "        self._asset.set_joint_velocity_target(0.5 * self.processed_actions, joint_ids=self._joint_ids)\n"
+    arm = "        self._asset.set_joint_position_target(self.processed_actions, joint_ids=[0])\n"
+    own = ("wheel = mdp.JointVelocityActionCfg(", "wheel = mdp.JointVelocityActionCfg(class_type=Half, ")
+    env = started(rover(tmp_path / "rover", HALF.replace(both, both + arm), [own]))
+    with caplog.at_level(logging.WARNING):
+        stepped(env, 2)
+    (text,) = [text for text in caplog.messages if "have no effect" in text]
+    assert "rover_env.py:" in text
+    assert "position targets of arm have no effect" in text
