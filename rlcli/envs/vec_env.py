@@ -244,17 +244,21 @@ class VecEnv(Workflow):
     def _reset_ended(self, ended: Selection | None, restart: Tensor | None) -> None:
         if ended is not None:
             self._before_reset(ended)
-            self._reset_envs(ended)
+            self._reset_envs(ended, self.config.keep_state_at_reset)
         again = None if restart is None else self._select(restart)
         if again is not None:
             self._reset_envs(again)  # the episode index is unchanged, so the draws repeat
 
-    def _reset_envs(self, selection: Selection) -> None:
-        """Start the next episode of the selected environments."""
+    def _reset_envs(self, selection: Selection, keep_state: bool = False) -> None:
+        """Start the next episode of the selected environments, in the default or (`keep_state`) the present state."""
+        fields = [self.engine.field(name) for name in ("qpos", "qvel")] if keep_state else []
+        kept = [selection.read(field) for field in fields]
         self.engine.reset(selection)
         if self.terrain is not None:
             self.terrain.place_entities(self.entities.values(), selection)
-        self.sim.refresh_rows(selection)  # reset events then read the default state, not that of the last episode
+        for field, values in zip(fields, kept, strict=True):
+            selection.write(field, values)
+        self.sim.refresh_rows(selection)  # reset events then read this state
         for actuator in self.actuators.values():
             actuator.reset(selection)
         self._reset_workflow(selection)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections import Counter
 from collections.abc import Callable
@@ -29,6 +30,8 @@ class CommandTerm(Protocol):
 
     Optional members:
 
+    - `compute(count)`, if it exists, is called each step instead of `update()`: it calls `count()`, which counts the
+      step of the timers and resamples, and updates the command.
     - `metrics() -> dict[str, Tensor]` returns how far the robot is from the command, (num_envs,) each. The means over
       an episode are logged.
     - `reset(selection)`, `state_dict()` and `load_state_dict(state)` are for further state of the term.
@@ -175,6 +178,11 @@ class CommandManager(TensorState):
         number = list(self._by_name).index(name)
         return self._steps_left[number] * self._step_dt
 
+    def set_time_left(self, name: str, where: Tensor, time: Tensor) -> None:
+        """Set the time until a command is resampled, `time` [s], in the environments `where`. (num_envs,) each"""
+        left = self._steps_left[list(self._by_name).index(name)]
+        left.copy_(torch.where(where, _whole_steps(time.double() / self._step_dt), left))
+
     def measure(self) -> None:
         """Add the terms' metrics of this step to their sums over the episode, before commands are resampled."""
         if not self._measured:
@@ -214,14 +222,21 @@ class CommandManager(TensorState):
             running: 0 where an episode has just begun, so that its timer does not count yet, else 1. (num_envs,)
         """
         for number, term in enumerate(self.terms):
-            left = self._steps_left[number]
-            left -= running
-            due = select(left <= 0)
-            if due is not None:
-                self._resample(number, due, _NEXT)
-            term.instance.update()
+            count = functools.partial(self._count_step, number, select, running)
+            if hasattr(term.instance, "compute"):
+                term.instance.compute(count)
+            else:
+                count()
+                term.instance.update()
         for name, knob in self._held_knobs.items():
             self._by_name[knob.term].instance.command[:, knob.column] = self.held[name]
+
+    def _count_step(self, number: int, select: Select, running: Tensor) -> None:
+        left = self._steps_left[number]
+        left -= running
+        due = select(left <= 0)
+        if due is not None:
+            self._resample(number, due, _NEXT)
 
     def tensors(self) -> dict[str, Tensor]:
         """Return the tensors to save: resampling timers, sums of metrics, and commands, by name."""
@@ -232,9 +247,13 @@ class CommandManager(TensorState):
         term, (low, high) = self.terms[number], self._times[number]
         drawn = selection.stream(term.stream ^ when)
         steps = drawn.uniform(low, high).double() / self._step_dt
-        # the slack absorbs rounding: 0.1 s at 0.02 s are 5 steps
-        selection.write(self._steps_left[number], (steps * (1.0 - 1e-6)).ceil_().clamp_(min=1).long())
+        selection.write(self._steps_left[number], _whole_steps(steps).clamp_(min=1))
         term.instance.resample(drawn)
+
+
+def _whole_steps(steps: Tensor) -> Tensor:
+    """Return a number of steps, rounded up; the slack absorbs rounding: 0.1 s at 0.02 s are 5 steps."""
+    return (steps * (1.0 - 1e-6)).ceil_().long()
 
 
 def _require_marker(term: BoundTerm, marker: Marker, num_envs: int) -> None:

@@ -41,6 +41,8 @@ class EventManager(TensorState):
         self._intervals = list(zip(self._interval, self._steps_left.unbind(0), strict=True))
         self._resets_derive = any(map(_derives, self._reset))
         self._term_resets = resets(terms)
+        self.leader = next((term.name for term in self._reset if getattr(term.instance, "fires_resets", False)), None)
+        """Name of the only reset event that `reset` fires: it calls `fire_resets` for the others. None: all fire."""
 
     @property
     def derives(self) -> bool:
@@ -72,18 +74,28 @@ class EventManager(TensorState):
         """Fire the reset events of new episodes, and start their interval timers; `step` is the training step."""
         for reset in self._term_resets:
             reset(selection)
+        if self.leader is None:
+            self.fire_resets(selection, step)
+        for term, _ in self._resets:
+            if term.name == self.leader:
+                term.call(selection.stream(term.stream))
+        if self._resets_derive:
+            self._set_constants(selection)
+        for term, left in self._intervals:
+            if not _is_global(term):
+                selection.write(left, self._draw(term, selection, _FIRST))
+
+    def fire_resets(self, selection: Selection, step: Tensor) -> None:
+        """Fire the reset events except the `leader`, in the order of the configuration; `step` is the training step."""
         for term, fired_at in self._resets:
+            if term.name == self.leader:
+                continue
             min_steps = term.config.min_steps_between  # type: ignore[attr-defined]
             due = selection.where(step - fired_at >= min_steps) if min_steps else selection
             if due is not None:
                 term.call(due.stream(term.stream))
                 if min_steps:
                     due.write(fired_at, step.expand(1))
-        if self._resets_derive:
-            self._set_constants(selection)
-        for term, left in self._intervals:
-            if not _is_global(term):
-                selection.write(left, self._draw(term, selection, _FIRST))
 
     def interval(self, select: Select, running: Tensor, fired: Callback) -> None:
         """Count a step of the interval timers, and fire the events that are due.

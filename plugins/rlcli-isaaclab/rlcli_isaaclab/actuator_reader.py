@@ -219,7 +219,7 @@ def _merge(
     if kept:
         which = listing(sorted(kept), 6)
         why = f"the damping of the MJCF's joints, at most {max(kept.values()):g}, acts in addition: {which}"
-        report.entries["scene", name, "actuators", "damping"] = ("approximated", why)
+        report.entries["scene", name, "actuators", f"damping of {which}"] = ("approximated", why)
     joints: dict[str, Any] = {}
     for pattern in dict.fromkeys([*(pattern for pattern, _, _ in settings), *map(re.escape, by_joint)]):
         matched = report.matching([pattern], model["joint"], ("scene", name, "actuators"))

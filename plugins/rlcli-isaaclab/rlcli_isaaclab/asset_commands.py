@@ -16,7 +16,7 @@ from rlcli.scene.jacobian import Jacobian
 from rlcli.scene.model_fields import DERIVED_FROM
 from rlcli.sim.env_selection import Selection
 from rlcli.sim.rotations import rotate
-from rlcli_isaaclab.missing_names import report_once
+from rlcli_isaaclab.missing_names import report_once, user_place
 from rlcli_isaaclab.substeps import Substeps, update_state
 from rlcli_isaaclab.utils.math import skew_symmetric_matrix
 
@@ -31,6 +31,9 @@ class JointDrive:
         self._undriven = [c for c in range(count) if c not in self._columns] if kind != "position" else []
         self._name, self._kind, self._joints = entity.name, kind, list(entity.joint_names)
         self._command = JointCommand(entity, kind, self._columns) if self._columns else None
+        self._env, self._entity, self._knows_actions = env, entity, False
+        self._driven: set[int] = set()
+        self._checked: set[int] = set()
         self.target = torch.zeros(env.num_envs, count, device=env.device)
         if kind == "position":
             self.target.copy_(entity.data.default_joint_pos)
@@ -62,8 +65,27 @@ class JointDrive:
                 f" {listing(self._joints[self._undriven[i]] for i in wrong)}",
                 hint="add actuators of this kind to the MJCF",
             )
+        if not self._knows_actions and hasattr(self._env, "action_manager"):
+            self._leave_out_driven()
+        if self._driven and isinstance(joint_ids, list | Tensor) and id(joint_ids) not in self._checked:
+            self._checked.add(id(joint_ids))
+            both = self._driven & set(torch.as_tensor(joint_ids).tolist())
+            if both:
+                names = listing(self._joints[c] for c in sorted(both))
+                report_once(f"{user_place()}the task's {self._kind} targets of {names} have no effect: an action of"
+                            " Isaac Lab drives these joints")  # fmt: skip
         if self._command is not None:
             self._command.write(self.target[:, self._columns])
+
+    def _leave_out_driven(self) -> None:
+        """Leave the joints out that a built-in action of rlcli drives: it writes the targets of its joints itself."""
+        self._knows_actions = True
+        driven = {sink for term in self._env.action_manager.terms for sink in getattr(term.instance, "sinks", ())}
+        sinks = [] if self._command is None else self._command.sinks
+        free = [column for column, sink in zip(self._columns, sinks, strict=True) if sink not in driven]
+        if free != self._columns:
+            self._driven, self._columns = set(self._columns) - set(free), free
+            self._command = JointCommand(self._entity, self._kind, free) if free else None
 
 
 class BodyWrench:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from rlcli_isaaclab.config_class import is_missing, to_dict
+from rlcli_isaaclab.reset_state import keeps_state
 from rlcli_isaaclab.scene_reader import SceneReader
 from rlcli_isaaclab.settings import Key, Node, Report, as_float, kind_of
 from rlcli_isaaclab.term_reader import TermReader
@@ -59,6 +60,8 @@ def task(
         terms_of_section = (terms.read_terms(section, *member) for member in top.node(section).nodes())
         config[section] = {name: term for pairs in terms_of_section for name, term in pairs}
     config["events"] |= actuator_events(scene.user_actuators)
+    if keeps_state(config["events"], scene, config["scene"]["entities"]):
+        config["keep_state_at_reset"] = True
     if not config["rewards"]:
         config["rewards"] = {"no_reward": {"func": "is_alive", "weight": 0.0}}
     config["commands"] = {name: terms.read_command(node) for name, node in top.node("commands").nodes()}

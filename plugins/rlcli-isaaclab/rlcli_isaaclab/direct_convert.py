@@ -16,6 +16,8 @@ from rlcli_isaaclab import convert
 from rlcli_isaaclab.config_class import is_missing, to_dict
 from rlcli_isaaclab.direct_env import DirectRLEnvCfg, record, shape_of
 from rlcli_isaaclab.direct_terms import HookTerm
+from rlcli_isaaclab.own_classes import warn_of_methods
+from rlcli_isaaclab.reset_state import note_episode_lengths
 from rlcli_isaaclab.scene_facade import Asset
 from rlcli_isaaclab.scene_reader import SceneReader
 from rlcli_isaaclab.sensor_facade import TerrainImporter
@@ -70,6 +72,7 @@ def direct_task(cfg: Any, env_class: type, root: Path, models: Mapping[str, Any]
         "decimation": cfg.decimation,
         "episode_length_s": float(cfg.episode_length_s),
         "reward_dt_scaling": False,
+        "keep_state_at_reset": True,
         "sim": convert.read_sim(top.node("sim")),
         "viewer": convert.read_viewer(top.node("viewer")),
         "scene": scene.read(),
@@ -102,6 +105,10 @@ def direct_task(cfg: Any, env_class: type, root: Path, models: Mapping[str, Any]
         states = hook("critic", shape_of(cfg.state_space, "state_space"))
         config["observations"]["critic"] = {"state": {"func": states}}
     convert.note_general_settings(top)
+    note_episode_lengths(env_class, report)
+    methods = warn_of_methods("the environment", env_class, ("step", "reset", "seed"))
+    if methods:
+        report.entries[("env_class",)] = ("ignored", methods)
     top.mark_mapped(*_READ)
     known = {field.name: data[field.name] for field in dataclasses.fields(DirectRLEnvCfg)}
     report.finish(known | {"scene": scene_data}, to_dict(DirectRLEnvCfg()))

@@ -191,9 +191,14 @@ class DirectRLEnv(gymnasium.Env):
         raise NotImplementedError(f"class {type(self).__name__} has no method _get_dones; implement it")
 
     def _reset_idx(self, env_ids: Any) -> None:
-        """Remove the forces on bodies in the environments `env_ids`; rlcli resets the rest and runs reset events."""
+        """Remove the forces on bodies in the environments `env_ids`, and run reset events; rlcli resets the rest."""
         for asset in self.scene.articulations.values():
             asset.reset(env_ids)
+        if self.rlcli_fire_resets is not None:
+            self.rlcli_fire_resets()
+
+    rlcli_fire_resets: Any = None
+    """Function that runs the reset events in the environments that are now reset; None outside of a reset."""
 
     def _set_debug_vis_impl(self, debug_vis: bool) -> None:
         """Do nothing: rlcli does not draw the markers of direct tasks."""

@@ -24,7 +24,7 @@ from rlcli_isaaclab.runtime import facade_of
 from rlcli_isaaclab.substeps import Substeps
 from rlcli_isaaclab.task_fields import set_own_fields
 from rlcli_isaaclab.user_files import adapt_to_device
-from rlcli_isaaclab.utils.buffers import call_without_effects
+from rlcli_isaaclab.utils.buffers import call_without_effects, set_tensors, tensors_of
 
 _OWN_METRICS = ("Episode_Reward/reward", "Episode_Termination/terminated", "Episode_Termination/time_out")
 """Metrics that rlcli computes for each direct task."""
@@ -78,7 +78,7 @@ class DirectRunner:
         self.observation_noise = noise_model(cfg.observation_noise_model, managed)
         facade_of(managed).extras = self.lab.extras  # events of the configuration get this object as `env`
         managed.task_log = self.log = ExtrasLog(lambda: self.lab.extras, _OWN_METRICS)
-        self._memory = AttributeState(self.lab, excluded=("cfg", "managed", "sim", "scene"))
+        self._memory = AttributeState(self.lab, excluded=("cfg", "managed", "sim", "scene", "rlcli_fire_resets"))
         self._observed: dict[str, Tensor] = {}
 
     def apply(self) -> None:
@@ -88,13 +88,23 @@ class DirectRunner:
             asset.apply_wrenches()
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return copies of the task's tensors."""
-        return dict(self._memory.state_dict())
+        """Return copies of the tensors of the task and of its noise models."""
+        state = dict(self._memory.state_dict())
+        for name, model in self._noise_models().items():
+            state |= {f"{name}.{path}": value.clone() for path, value in tensors_of(model).items()}
+        return state
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Restore the tensors returned by `state_dict`."""
-        self._memory.load_state_dict(state)
+        for name, model in self._noise_models().items():
+            start = f"{name}."
+            set_tensors(model, {p.removeprefix(start): v for p, v in state.items() if p.startswith(start)})
+        names = tuple(f"{name}." for name in self._noise_models())
+        self._memory.load_state_dict({path: value for path, value in state.items() if not path.startswith(names)})
         self.phase = "restored"
+
+    def _noise_models(self) -> dict[str, Any]:
+        return {"rlcli_action_noise": self.action_noise, "rlcli_observation_noise": self.observation_noise}
 
     def process(self, action: Tensor) -> None:
         """Call `_pre_physics_step` with the action and its noise, and `_apply_action` in the next physics steps."""
@@ -115,7 +125,12 @@ class DirectRunner:
         """Call `_reset_idx` for the selected environments, and reset the noise models there."""
         ids = selection.env_ids()
         if len(ids):
-            self.log.call_reset(lambda: self.lab._reset_idx(ids))
+            events, step = self.managed.event_manager, self.managed._counters.common_step
+            self.lab.rlcli_fire_resets = lambda: events.fire_resets(selection, step)
+            try:
+                self.log.call_reset(lambda: self.lab._reset_idx(ids))
+            finally:
+                self.lab.rlcli_fire_resets = None
             self.observation_noise.reset(ids)
             self.action_noise.reset(ids)
         self.phase = "reset"
@@ -217,6 +232,9 @@ class _Reward(_Hook):
 
 
 class _Reset(_Hook):
+    fires_resets = True
+    """The other reset events run when `_reset_idx` of the task calls that of `DirectRLEnv`."""
+
     def __call__(self, selection: Selection) -> None:
         self._runner.reset_envs(selection)
 

@@ -196,38 +196,47 @@ class CommandTerm(ManagerTermBase):
         super().__init__(cfg, env)
         self.metrics: dict[str, Tensor] = {}
         self.command_counter = torch.zeros(env.num_envs, dtype=torch.long, device=env.device)
+        self.time_left = torch.zeros(env.num_envs, device=env.device)
+        """Time until the next resampling. (num_envs,) [s]"""
 
-    rlcli_name: str
-    """Name of the term in the task, which rlcli sets."""
+    rlcli_timer: Any = None
+    """Function that updates the metrics of new episodes, and resamples the commands whose time is over."""
+    rlcli_draws_time = False
+    """Whether rlcli itself draws `time_left` of the commands that are sampled now."""
 
     @property
     def command(self) -> Tensor:
         """Current command. (num_envs, k)"""
         raise NotImplementedError
 
-    @property
-    def time_left(self) -> Tensor:
-        """Time until the next resampling. (num_envs,) [s]"""
-        left: Tensor = self._env.managed.command_manager.time_left(self.rlcli_name)
-        return left
-
-    def reset(self, env_ids: Any = None) -> dict[str, float]:
-        """Reset the counter and the metrics. The environment samples the first command of an episode afterwards."""
-        rows = slice(None) if env_ids is None else env_ids
-        self.command_counter[rows] = 0
+    def reset(self, env_ids: Any = None) -> dict[str, Any]:
+        """Reset the counter and the metrics, and sample the first command of an episode; return the last metrics."""
+        rows = torch.arange(self.num_envs, device=self.device) if env_ids is None else env_ids
+        means = {name: torch.mean(metric[rows].float()) for name, metric in self.metrics.items()}
         for metric in self.metrics.values():
             metric[rows] = 0.0
-        return {}
+        self.command_counter[rows] = 0
+        self._resample(rows)
+        return means
+
+    def compute(self, dt: float) -> None:
+        """Count a step of `dt` [s], resample the commands whose time is over, and update all commands."""
+        self.rlcli_timer()
+        self._update_command()
 
     def set_debug_vis(self, debug_vis: bool) -> bool:
         """Do nothing, because the user's own commands are not drawn; return False."""
         return False
 
     def _resample(self, env_ids: Any) -> None:
-        """Sample new commands for the environments `env_ids` now.
+        """Sample new commands for the environments `env_ids` now, and the time for which they last.
 
         `_update_command` may call this method before the resampling time is over.
         """
+        if len(env_ids) == 0:
+            return
+        if not self.rlcli_draws_time:
+            self.time_left[env_ids] = self.time_left[env_ids].uniform_(*self.cfg.resampling_time_range)
         self._resample_command(env_ids)
         self.command_counter[env_ids] += 1
 

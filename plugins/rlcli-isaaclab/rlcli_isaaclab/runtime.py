@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import functools
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -276,7 +275,6 @@ class ManagerBasedRLEnv(gymnasium.Env):
         return self._manager_facades[name]
 
 
-@functools.cache
 def environment_class(entry: Any) -> type | None:
     """Return the environment class that a task defines, a subclass of `ManagerBasedRLEnv`.
 

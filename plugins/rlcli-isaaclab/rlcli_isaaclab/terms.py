@@ -23,6 +23,7 @@ from torch import Tensor
 from rlcli.config.schema import Names, Number, StrictModel
 from rlcli.config.term_signatures import SECTIONS, Parameter, Signature, SignatureError
 from rlcli.sim.env_selection import Selection
+from rlcli_isaaclab.bound_objects import BoundCommand, BoundObject
 from rlcli_isaaclab.config_class import is_missing
 from rlcli_isaaclab.direct_env import building
 from rlcli_isaaclab.managers import ManagerTermBaseCfg, SceneEntityCfg
@@ -38,7 +39,6 @@ from rlcli_isaaclab.user_files import (
     term_reads_body_forces,
     unset_simple,
 )
-from rlcli_isaaclab.utils.buffers import set_tensors, tensors_of
 
 _RESERVED = {name for model in SECTIONS.values() for name in model.model_fields} | {"params"}
 _PLAIN: dict[Any, Any] = {float: Number, int: int | Number, bool: bool, str: str}
@@ -282,26 +282,7 @@ class _Bound:
         return value.bool() if self._section == "terminations" and value.dtype != torch.bool else value
 
 
-class _BoundObject:
-    """Base class of terms in one environment that have an object of the user's class, and save its tensors."""
-
-    term: Any
-
-    def reset(self, selection: Selection) -> None:
-        """Reset the user's object in the environments whose episode starts."""
-        if hasattr(self.term, "reset"):
-            self.term.reset(selection.env_ids())
-
-    def state_dict(self) -> dict[str, Tensor]:
-        """Return copies of the tensors of the user's object, by the path of the attribute."""
-        return {name: value.clone() for name, value in tensors_of(self.term).items()}
-
-    def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Restore the tensors returned by `state_dict`."""
-        set_tensors(self.term, state)
-
-
-class _BoundClass(_Bound, _BoundObject):
+class _BoundClass(_Bound, BoundObject):
     """Term in one environment that calls an object of the user's class: a term with a state."""
 
     def __call__(self, selection: Selection | None = None) -> Any:
@@ -310,42 +291,15 @@ class _BoundClass(_Bound, _BoundObject):
         return super().__call__(selection)
 
 
-class _BoundCommand(_BoundObject):
-    """Command term in one environment that runs an object of the user's class, a `CommandTerm`."""
+class _ActionSteps(Substeps):
+    """Caller of an action's `apply`, which resets the asset of the action before the reset events, as Isaac Lab."""
 
-    def __init__(self, term: Any) -> None:
-        self.term = term
-        self.command, self._has_command = term.command.clone().float(), False
-        self.elements, self.units = getattr(term, "elements", None), getattr(term, "units", ())
-
-    @property
-    def limits(self) -> Any:
-        return getattr(self.term, "limits", ())
-
-    def resample(self, selection: Selection) -> None:
-        """Sample new commands in the selected environments."""
-        self.term._resample(selection.env_ids())
-        self.command.copy_(self.term.command)
-        self._has_command = True
-
-    def update(self) -> None:
-        """Update the commands of all environments; the command manager calls this once per environment step."""
-        self.term._update_command()
-        self.command.copy_(self.term.command)
-
-    def metrics(self) -> dict[str, Tensor]:
-        """Return the metrics that the user's class computes, by name. (num_envs,) each"""
-        if self._has_command:  # before the first command is sampled, the metrics have no meaning
-            self.term._update_metrics()
-        return dict(self.term.metrics)
-
-    def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Restore the tensors returned by `state_dict`."""
-        super().load_state_dict(state)
-        self._has_command = True
+    def reset(self, selection: Selection) -> None:
+        """Reset the asset in the environments whose episode starts."""
+        self._code.reset_asset(selection)  # type: ignore[attr-defined]
 
 
-class _BoundAction(_BoundObject):
+class _BoundAction(BoundObject):
     """Action term in one environment that runs an object of the user's class, an `ActionTerm`."""
 
     unit = ""
@@ -356,7 +310,7 @@ class _BoundAction(_BoundObject):
         self.elements = tuple(f"{name}[{i}]" for i in range(self.size))
         self.sinks = (f"action {name}",)
         term._asset.start_wrenches(by_task=True)
-        self._substeps = Substeps(managed, f"action {name}", self)
+        self._substeps = _ActionSteps(managed, f"action {name}", self)
 
     def process(self, action: Tensor) -> None:
         """Pass the policy's action to `process_actions` of the user's class. (num_envs, action_dim)"""
@@ -369,9 +323,8 @@ class _BoundAction(_BoundObject):
         self.term._asset.write_data_to_sim()
         self.term._asset.apply_wrenches()
 
-    def reset(self, selection: Selection) -> None:
-        """Reset the action and its asset at the start of episodes."""
-        super().reset(selection)
+    def reset_asset(self, selection: Selection) -> None:
+        """Remove the forces on the asset, before the reset events."""
         self.term._asset.reset(selection.env_ids())
 
     def state_dict(self) -> dict[str, Tensor]:
@@ -386,7 +339,7 @@ class _BoundAction(_BoundObject):
         super().load_state_dict({name: value for name, value in state.items() if not name.startswith("asset.")})
 
 
-def _bind_object(term: UserObject, env: Any, **params: Any) -> _BoundObject:
+def _bind_object(term: UserObject, env: Any, **params: Any) -> BoundObject:
     from rlcli_isaaclab.runtime import facade_of
 
     cfg, facade = term.settings(params), facade_of(env)
@@ -396,8 +349,7 @@ def _bind_object(term: UserObject, env: Any, **params: Any) -> _BoundObject:
         cfg.resampling_time_range = tuple(env.config.commands[term.name].resampling_time_s)
     with building(env):
         made = adapt_to_device(term.function, env.device)(cfg, facade)
-    made.rlcli_name = term.name
-    return _BoundAction(made, env, term.name) if term.section == "actions" else _BoundCommand(made)
+    return _BoundAction(made, env, term.name) if term.section == "actions" else BoundCommand(made, env, term.name)
 
 
 def _bind_setting(term: SettingTerm, env: Any, **opened: Tensor) -> _BoundClass:

@@ -10,11 +10,13 @@ from test_isaaclab_packages import stepped
 from test_isaaclab_user_code import rover
 
 from rlcli.config.load import resolve
+from rlcli.envs.make import make_env
 from rlcli.errors import ConfigError, TaskError
 from rlcli.formats import log_notes
 from rlcli.registry import find_task
 from rlcli.registry.task_code_monitor import error_of_task
 from rlcli_isaaclab.own_classes import own_methods
+from rlcli_isaaclab.runtime import facade_of
 from rlcli_isaaclab.scene_facade import Asset
 
 ID = "Template-Cartpole-v0"
@@ -243,3 +245,18 @@ def test_name_that_isaac_lab_lacks_is_said_to_be_of_another_version(carts):
     ) as found:
         resolve(find_task(f"{carts}:{ID}"))
     assert found.value.hint.startswith("Isaac Lab 2.3.2 has no 'SpringPDActuatorCfg' (a newer or changed Isaac Lab")
+
+
+def test_tasks_of_two_packages_of_one_name_use_their_own_environment_classes(tmp_path):
+    found = []
+    for value in ("1.0", "2.0"):
+        folder = write(tmp_path / value[0] / "carts")
+        methods = OWN_ENV.format(name="OwnEnv", methods="").replace("return 1.0", f"return {value}")
+        (folder / "cartpole_env_cfg.py").write_text(ENV + methods)
+        own = START.replace('"isaaclab.envs:ManagerBasedRLEnv"', 'f"{__name__}.cartpole_env_cfg:OwnEnv"')
+        (folder / "__init__.py").write_text(own)
+        found.append(resolve(find_task(f"{folder}:{ID}")))
+        for name in [name for name in sys.modules if name.partition(".")[0] == "carts"]:
+            del sys.modules[name]
+        gymnasium.registry.pop(ID, None)
+    assert [facade_of(make_env(resolved, seed=0)).bonus() for resolved in found] == [1.0, 2.0]

@@ -125,6 +125,9 @@ class TaskConfig(StrictModel):
     reward_dt_scaling: bool = True
     """true: rewards of manager-based tasks are multiplied by step_dt, so that returns do not depend on the control
     rate."""
+    keep_state_at_reset: bool = False
+    """true: an episode starts in the last state of the previous episode, which reset events change, as in Isaac Lab;
+    false: in the default state. The first episodes after a reset of all environments start in the default state."""
     divergence_reward: Number | None = None
     """Reward of the step in which an environment diverged; null: the reward of its last finite state. The episode is
     terminated."""

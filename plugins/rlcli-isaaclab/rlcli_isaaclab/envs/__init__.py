@@ -69,7 +69,8 @@ class ManagerBasedEnvCfg:
         entry = getattr(self, "_rlcli_class", OWN_CLASS)
         if entry not in (OWN_CLASS, ManagerBasedRLEnv):
             why = "terms can call methods of the task's own environment class; rlcli itself calls none of them"
-            skipped = warn_of_methods("the environment", environment_class(entry), WORKFLOW)
+            self._rlcli_class = environment_class(entry)  # now: another package of this name may be imported later
+            skipped = warn_of_methods("the environment", self._rlcli_class, WORKFLOW)
             report.entries[("entry_point",)] = ("ignored", f"{why}; {skipped}" if skipped else why)
         data = task(to_dict(self), report, root, models=models, cfg=self)
         return PythonTask(data, notes=report.user_notes())
