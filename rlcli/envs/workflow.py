@@ -123,7 +123,8 @@ class Workflow(Environment):
 
     def episode_dependencies(self) -> list[str]:
         """Return parts of the configuration that make an episode depend on earlier ones, such as `scene.terrain`."""
-        return ["scene.terrain"] if self.terrain is not None else []
+        terrain = ["scene.terrain"] if self.terrain is not None else []
+        return terrain + (["keep_state_at_reset"] if self.config.keep_state_at_reset else [])
 
     def step_metrics(self) -> dict[str, Tensor]:
         """Return the values that a direct task wrote to `extras` in this step, by name. (num_envs,) each

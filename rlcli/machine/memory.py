@@ -20,7 +20,9 @@ _NO_MEMORY = re.compile(
 )
 """Texts of the errors of MuJoCo, torch, the dynamic linker and Python that mean too little memory; their classes
 differ."""
-_UNDER_A_LIMIT = re.compile(r"failed to load the shared library|framebuffer is not complete", re.IGNORECASE)
+_UNDER_A_LIMIT = re.compile(
+    r"failed to load the shared library|framebuffer is not complete|caught an unknown exception", re.IGNORECASE
+)
 """Texts of errors of Warp and OpenGL that can have several causes. If the process has a memory limit, these errors mean
 too little memory."""
 
