@@ -6,8 +6,8 @@ another framework has a method `__rlcli_task__(root, models) -> PythonTask`; its
 another framework has a method `__rlcli_agent__(notes)`; its optional method `__rlcli_fit__(agent, observations, notes)`
 adapts the settings to the observation groups of the task.
 
-Terms are names or functions. A function that is not a term of `rlcli.mdp` becomes one of the task's own terms under its
-name.
+Terms are names, functions or classes. A function or class that is not a term of `rlcli.mdp` becomes one of the task's
+own terms: under its name, a class in snake_case.
 """
 
 import copy

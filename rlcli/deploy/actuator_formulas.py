@@ -23,7 +23,8 @@ def actuator_models(env: VecEnv, terms: Iterable[BoundTerm], controls: list[dict
     Args:
         env: the environment.
         terms: the action terms.
-        controls: the description of each action term.
+        controls: the description of each action term. Its key `closed`, as in each description of a formula, says
+            whether the formula needs nothing from the task's code.
     """
     pairs = list(zip(terms, controls, strict=False))
     known = all(control["closed"] for control in controls)

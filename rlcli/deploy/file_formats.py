@@ -1,4 +1,4 @@
-"""Writers of the file formats of exported policies (ONNX, torch, numpy), and readers that check the written files.
+"""Writers of the file formats of exported policies (ONNX, torch, numpy), and readers to check the files.
 
 `rlcli.deploy.export` calls this module.
 """

@@ -79,10 +79,10 @@ def regulator(resolved: Resolved, bound: float | None) -> Regulator:
         model = env.engine.model
         if model.nq != model.nv:
             raise _no_regulator_error(
-                resolved, "it has a floating body or a ball joint; only hinges and slides are supported"
+                resolved, "the model has a floating body or a ball joint; only hinges and slides are supported"
             )
         if model.na:
-            raise _no_regulator_error(resolved, "its actuators have internal states")
+            raise _no_regulator_error(resolved, "the model's actuators have internal states")
         count = 2 * model.nv + env.layout.action_size
     with contextlib.closing(make_env(resolved.with_num_envs(2 + 16 * count).without_randomness())) as env:
         states, after, observed, rest = _sample_steps(env, resolved)
@@ -96,7 +96,7 @@ def regulator(resolved: Resolved, bound: float | None) -> Regulator:
     decoder, residual = _fit(observed, after)
     if residual.max() > _MAX_RESIDUAL:
         unseen = listing(_coordinates(env)[i] for i in (residual > _MAX_RESIDUAL).nonzero()[0])
-        raise _no_regulator_error(resolved, f"its observations do not determine the state: {unseen}")
+        raise _no_regulator_error(resolved, f"the task's observations do not determine the state: {unseen}")
     a, b = dynamics[:nx].T, dynamics[nx:].T  # x+ = a x + b u
     gain = riccati(a, b, np.eye(nx), np.eye(b.shape[1]) / (bound or 1.0) ** 2)
     poles = tuple(sorted(np.abs(np.linalg.eigvals(a - b @ gain)).tolist(), reverse=True)) if gain is not None else ()

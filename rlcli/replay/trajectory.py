@@ -255,7 +255,8 @@ class Header(_Strict):
         """Check that the numbers of steps, calls and episodes fit each other and the kind of the file."""
         for world in self.worlds:
             if len(world.follows) != len(world.nstep) - 1 or world.first >= len(world.nstep):
-                raise ValueError(f"the file is damaged: the engine calls of environment {world.env} do not match")
+                message = f"the lists `nstep` and `follows` of environment {world.env}, or its number `first`"
+                raise ValueError(f"{message}, do not fit together")
         if sum(count for world in self.worlds for count in world.nstep) > MAX_SUBSTEPS:
             raise ValueError(f"the file is damaged: it has more than {MAX_SUBSTEPS} physics steps")
         for number, e in enumerate(self.episodes):

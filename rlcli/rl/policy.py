@@ -304,8 +304,8 @@ def blank_policy(spec: Mapping[str, object]) -> Policy:
         checked = PolicySpec.model_validate(spec)
     except ValidationError as error:
         first = next(messages.problems(error, PolicySpec, spec, messages.dotted))
-        place = first.path[:80] or "all"
-        raise CheckpointError(f"policy.json is not valid; {_OTHER}: {place}: {first.message}") from None
+        place = f"{first.path[:80]}: " if first.path else ""
+        raise CheckpointError(f"policy.json is not valid: {place}{first.message}; {_OTHER}") from None
     with torch.device("meta"):
         policy = Policy(checked)
     if size_of(policy) > _MAX_BYTES:

@@ -57,7 +57,7 @@ def open_bundle(folder: Path) -> Checkpoint:
     version = bundle.manifest.get("bundle")
     if type(version) is not int or version != BUNDLE:
         message = f"{folder} has bundle version {str(version)[:40]}; this rlcli reads {BUNDLE}"
-        raise CheckpointError(message, hint="install the rlcli version that manifest.json in the bundle names")
+        raise CheckpointError(message, hint="install the version that wrote the bundle, or export the policy again")
     check_json(_BundleRecord, bundle.manifest, folder / "manifest.json")
     return bundle
 

@@ -138,7 +138,7 @@ class Entity:
         selection.write(self._qpos, torch.cat([position, quat], dim=1), slice(root, root + 7))
 
     def write_root_velocity(self, selection: Selection, linear_w: Tensor, angular_w: Tensor) -> None:
-        """Set the root's velocity, world frame; set the pose first. A mocap root has no velocity.
+        """Set the root's velocity, world frame; set the pose first. For a mocap root the call does nothing.
 
         Args:
             selection: the environments.
@@ -155,9 +155,9 @@ class Entity:
         selection.write(self._qvel, torch.cat([linear_w, local], dim=1), slice(dof, dof + 6))
 
     def read_root_velocity(self, selection: Selection) -> tuple[Tensor, Tensor]:
-        """Return the root's linear and angular velocity, world frame, read from the engine. (rows, 3) each
+        """Return the velocity of the root's `velocity_point` and the angular velocity, world frame. (rows, 3) each
 
-        Unlike `data.root_lin_vel_w`, the result includes a velocity that has just been set.
+        The values are those of the engine: unlike `data.root_lin_vel_w`, they include a velocity just set.
         """
         qpos, dof = self.floating()
         velocity = selection.read(self._qvel, slice(dof, dof + 6)).float()

@@ -99,7 +99,7 @@ class ModelsTogether:
     _models: list[CheckedModel] = field(default_factory=list)
 
     def add(self, model: CheckedModel) -> None:
-        """Add a checked model.
+        """Add the cost of a checked model to the sum; models of installed packages are not counted.
 
         Raises:
             BadModel: if the models are too large together.
@@ -110,8 +110,9 @@ class ModelsTogether:
         self.cost = self.cost.beside(model.cost)
         if self.cost.total > MAX_COST:
             raise BadModel(
-                f"{model.file}: the first {len(self._models)} models of the scene are too large together: their cost is"
-                f" {self.cost.total:,.0f}, at most {MAX_COST:,} is allowed (one element costs 1); use fewer entities"
+                f"{model.file}: the first {len(self._models)} models of the scene are too large together: the estimated"
+                f" cost of their compilation is {self.cost.total:,.0f}, at most {MAX_COST:,} is allowed (an ordinary"
+                " element costs 1, a mesh or image more); use fewer entities or smaller meshes"
             )
 
     def compile_expensive(self) -> None:

@@ -30,7 +30,10 @@ def as_index(positions: Sequence[int], device: torch.device | None = None) -> Co
 
 
 def evenly_spaced(positions: Sequence[int], device: torch.device | None = None) -> Columns:
-    """Return column positions as a slice if they are evenly spaced, or are all the same column, else as a tensor."""
+    """Return column positions as a slice if they ascend in equal steps, else as a tensor.
+
+    If all positions are the same column, the slice selects this column once, for broadcasting.
+    """
     steps = {after - before for before, after in itertools.pairwise(positions)} or {1}
     if len(positions) and len(steps) == 1 and min(steps) >= 0:
         return slice(positions[0], positions[-1] + 1, min(steps) or 1)

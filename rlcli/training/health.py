@@ -430,7 +430,7 @@ def _halved(gaps: list[float]) -> bool:
 
 
 def _approaches(values: list[float]) -> bool:
-    """Return whether the newest values are higher than the values in the middle of the list; true for short lists."""
+    """Return whether the newest values exceed those before the middle by over 5 %; True for short lists."""
     part, middle = max(3, len(values) // 8), len(values) // 2
     if len(values) < 4 * part:
         return True

@@ -276,8 +276,8 @@ def _log_std(weights: Mapping[str, Tensor], names: Mapping[str, str], file: Path
     if names["log_std"] in weights:
         return weights[names["log_std"]]
     if names["std"] not in weights:
-        message = f"{file}: the policy's standard deviation depends on the state, which cannot be imported"
-        raise CheckpointError(f"{message}; train with a standard deviation that does not")
+        message = f"{file}: a standard deviation that depends on the state cannot be imported"
+        raise CheckpointError(f"{message}; train with one that does not depend on the state")
     return weights[names["std"]].clamp(min=_MIN_STD).log()
 
 

@@ -1,4 +1,6 @@
-"""Signals (Ctrl-C, SIGTERM) that stop a training: the first signal after a checkpoint, a second signal at once.
+"""Signals (Ctrl-C, SIGTERM) that stop a training.
+
+After the first signal, the training writes a checkpoint and stops. A second signal stops the training at once.
 
 Commands that train use the context manager `StopRequest`.
 """

@@ -343,7 +343,8 @@ def read_sweep(folder: Path, storage: str | None = None) -> Sweep:
     try:
         parameters = read_parameters(settings["params"])
     except UsageError as error:
-        raise CheckpointError(f"{folder / STUDY} is corrupt: params: {error.message}") from None
+        hint = "restore the file from a backup, or start a new sweep in another folder"
+        raise CheckpointError(f"{folder / STUDY} is corrupt: params: {error.message}", hint=hint) from None
     return Sweep(folder, settings, parameters, study)
 
 

@@ -464,7 +464,7 @@ COPIES = model(body='<replicate count="4000"><geom size="0.1"/></replicate>')
 def test_models_of_many_entities_are_too_large_together(task, text):
     begin = time.process_time()
     with pytest.raises(
-        ConfigError, match=r"o\.xml: the first \d+ models of the scene are too large together: their cost"
+        ConfigError, match=r"o\.xml: the first \d+ models of the scene are too large together: the estimated"
     ):
         make_env(several(task, 300, text))
     assert time.process_time() - begin < 10

@@ -127,7 +127,10 @@ class HumanoidStandup(_Humanoid):
     params: Params
 
     def compute_reward(self) -> Tensor:
-        """Return weight x height / physics step, minus the costs of controls and contact forces, plus 1. (num_envs,)"""
+        """Return the reward for height, minus the costs of controls and contact forces, plus 1. (num_envs,)
+
+        The reward for height is `uph_cost_weight` times the height of the torso, divided by the physics step [s].
+        """
         params = self.params
         height = params.uph_cost_weight * self.field.qpos[:, 2] / self.env.physics_dt
         return height - self.control_cost() - self.force_cost(params.impact_cost_weight, params.impact_cost_range) + 1

@@ -58,8 +58,8 @@ def command(
         task: Task to sweep; or `show` or `compare`, followed by the folder or name of a sweep (without it: the newest).
         param: Setting to vary: KEY=LOW:HIGH, KEY=log:LOW:HIGH or KEY=A,B,C; repeatable.
         trials: Number of trials, over all processes of the sweep.
-        objective: return, success, length, reward_terms.NAME or terminations.NAME of the trained policy; @30s stops
-            a training after 30 s, @1e6 after 1,000,000 steps.
+        objective: return, success, length, reward_terms.NAME or terminations.NAME of the trained policy. With
+            @30s appended, as in success@30s, each training stops after 30 s; with @1e6, after 1,000,000 steps.
         minimize: Search for the smallest value of the objective.
         episodes: Number of episodes that evaluate a trial; with compare: each policy.
         jobs: Number of trials at a time in this process.

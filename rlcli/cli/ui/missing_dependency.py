@@ -1,6 +1,6 @@
 """Conversion of a failed import into an error with the pip command that installs the missing package.
 
-The main function converts failed imports of rlcli's optional dependencies in this way.
+rlcli's entry point (`rlcli.cli.app`) converts every failed import of a dependency, required or optional, in this way.
 """
 
 import re

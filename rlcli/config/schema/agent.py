@@ -80,7 +80,8 @@ class AgentConfig(StrictModel):
     autopsy: AutopsyConfig | None = AutopsyConfig()
     """Recording of failed and outlier episodes during training on a CPU; null: no recording."""
     torch_threads: Threads | None = None
-    """Number of CPU threads of the policy update; null: min(4, cores). Another number gives other rounding errors."""
+    """Number of CPU threads of the policy update; null: min(4, cores). Another number may give other
+    rounding errors (not for MLPs of `ppo` on a CPU)."""
     action_bound: Positive | None = 1.0
     """Actions of the policy are clipped to +-`action_bound` in training, play and export; null: no clipping."""
 

@@ -1,4 +1,4 @@
-"""Choice and check of the number of worker processes of an environment (`scene.workers`).
+"""Choice and check of the number of processes that step the environments (`scene.workers`), the main one included.
 
 The module imports neither torch nor MuJoCo, so that workers can be started before these slow imports.
 """

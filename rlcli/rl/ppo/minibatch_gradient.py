@@ -106,13 +106,14 @@ def has_closed_form(networks: ActorCritic, config: PpoConfig) -> bool:
 
 
 class ClosedFormGradient:
-    """Closed-form gradient for MLPs on a CPU.
+    """Gradient of a minibatch's loss in closed form, for MLPs on a CPU.
 
     Args:
         networks: actor and critic for which `has_closed_form` is true.
         out: vector for the gradient and, after it, the KL divergence.
         slices: parameter name -> slice of its gradient in `out`.
-        compute: factory of the computation of the layers' gradients, by threads or processes.
+        compute: function that takes the tensors for the gradients and returns the function that writes the gradients
+            there, such as the result of `threaded_gradients`.
     """
 
     def __init__(
