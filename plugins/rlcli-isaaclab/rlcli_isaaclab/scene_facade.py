@@ -16,7 +16,7 @@ from rlcli.scene.names import NameProblem
 from rlcli.sim.rotations import conjugate, multiply, rotate, rotate_inverse
 from rlcli_isaaclab.asset_commands import BodyWrench, JointDrive, PhysxView
 from rlcli_isaaclab.asset_data import Data
-from rlcli_isaaclab.missing_names import MissingMemberError, NoEffect, absence
+from rlcli_isaaclab.missing_names import MissingMemberError, NoEffect, absence, report_once
 from rlcli_isaaclab.sensor_facade import FrameTransformer, TerrainImporter, bound, camera_or_sensor, find_elements
 from rlcli_isaaclab.sensor_reader import filter_name
 from rlcli_isaaclab.setup_scene import current_setup
@@ -173,7 +173,10 @@ class Asset:
         self._write("qvel", self._entity.dof_columns, velocity, joint_ids, env_ids)
 
     def write_root_pose_to_sim(self, root_pose: Tensor, env_ids: Any = None) -> None:
-        """Set the root's position [m] and quaternion (w, x, y, z). (rows, 7)"""
+        """Set the root's position [m] and quaternion (w, x, y, z), world frame. (rows, 7)
+
+        A fixed root is not moved: another position is an error, and another orientation is reported once.
+        """
         if self._entity.mocap >= 0:
             mocap = torch.tensor([self._entity.mocap], device=self._env.device)
             self._write("mocap_pos", mocap, root_pose[:, None, :3], None, env_ids)
@@ -249,6 +252,10 @@ class Asset:
                 f"the base of '{self._entity.name}' is fixed in its MJCF, and the task moves it",
                 hint='add <freejoint/> to its body in the MJCF, or mocap="true" if only a reset moves it',
             )
+        cosine = (root_pose[:, 3:] * self.data.root_quat_w[rows]).sum(dim=1).abs()
+        if bool((cosine < 1.0 - 1e-4).any()):
+            name = self._entity.name
+            report_once(f"the base of '{name}' is fixed in its MJCF: the orientation that the task sets is ignored")
 
     def _write(self, field: str, columns: Tensor, values: Tensor, joint_ids: Any, env_ids: Any) -> None:
         target = self._env.engine.field(field)

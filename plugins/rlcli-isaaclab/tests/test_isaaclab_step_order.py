@@ -326,6 +326,16 @@ def test_episode_lengths_that_a_direct_task_sets_in_a_reset_are_reported(pole):
     assert not [note for note in pole((SUPER, zero)).notes if "episode_length_buf" in note.key]
 
 
+@pytest.mark.parametrize("turn", ["", "        pose[:, 3:] = torch.tensor([0.0, 0.0, 0.0, 1.0])\n"])
+def test_orientation_of_a_fixed_base_that_a_task_sets_is_reported(pole, caplog, turn):
+    pose = "        pose = self.robot.data.default_root_state[env_ids, :7].clone()\n"
+    write = "        self.robot.write_root_pose_to_sim(pose, env_ids)\n"
+    with caplog.at_level(logging.WARNING):
+        started(pole((SUPER, SUPER + pose + turn + write)))
+    reported = "is fixed in its MJCF: the orientation that the task sets is ignored" in caplog.text
+    assert reported is bool(turn)
+
+
 def test_step_of_a_direct_tasks_own_class_is_reported(pole, caplog):
     own = "    def step(self, action):\n        return super().step(2.0 * action)\n\n    def _get_rewards(self):"
     with caplog.at_level(logging.WARNING):
