@@ -48,7 +48,7 @@ def test_list_tasks_imports_no_plugin_and_no_heavy_module(plugins, cli):
     lines = done.stdout.splitlines()
     assert lines[-1] == "0 [] []"
     assert sum("SystemExit: imported" in line for line in lines[:-1]) == 3
-    assert "after a repair, load the tasks again: rlcli list-tasks --probe" in done.stderr
+    assert "after a repair, load again: rlcli list-tasks --probe" in done.stderr
 
 
 def cpu_time_of_children():
