@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from rlcli.envs.managed import ManagedEnv
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import TaskError, did_you_mean, listing
 from rlcli.scene.actuators import JointCommand
@@ -65,8 +66,8 @@ class JointDrive:
                 f" {listing(self._joints[self._undriven[i]] for i in wrong)}",
                 hint="add actuators of this kind to the MJCF",
             )
-        if not self._knows_actions and hasattr(self._env, "action_manager"):
-            self._leave_out_driven()
+        if not self._knows_actions and isinstance(self._env, ManagedEnv) and hasattr(self._env, "action_manager"):
+            self._leave_out_driven(self._env)
         if self._driven and isinstance(joint_ids, list | Tensor) and id(joint_ids) not in self._checked:
             self._checked.add(id(joint_ids))
             both = self._driven & set(torch.as_tensor(joint_ids).tolist())
@@ -77,10 +78,10 @@ class JointDrive:
         if self._command is not None:
             self._command.write(self.target[:, self._columns])
 
-    def _leave_out_driven(self) -> None:
+    def _leave_out_driven(self, env: ManagedEnv) -> None:
         """Leave the joints out that a built-in action of rlcli drives: it writes the targets of its joints itself."""
         self._knows_actions = True
-        driven = {sink for term in self._env.action_manager.terms for sink in getattr(term.instance, "sinks", ())}
+        driven = {sink for term in env.action_manager.terms for sink in getattr(term.instance, "sinks", ())}
         sinks = [] if self._command is None else self._command.sinks
         free = [column for column, sink in zip(self._columns, sinks, strict=True) if sink not in driven]
         if free != self._columns:

@@ -60,7 +60,9 @@ def note_episode_lengths(env_class: type, report: Report) -> None:
     """Report the line of `_reset_idx` of a direct task that sets the lengths of new episodes, which has no effect."""
     for base in env_class.__mro__:
         method = None if is_framework(base.__module__) else vars(base).get("_reset_idx")
-        for number, line in enumerate(inspect.getsource(method).splitlines()) if inspect.isfunction(method) else ():
+        if not inspect.isfunction(method):
+            continue
+        for number, line in enumerate(inspect.getsource(method).splitlines()):
             if _WRITES_LENGTH.search(line.partition("#")[0]):
                 place = f"{inspect.getsourcefile(method)}:{method.__code__.co_firstlineno + number}"
                 why = f"{place}: every episode starts at step 0; the lengths that _reset_idx sets are overwritten"
