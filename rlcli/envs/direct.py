@@ -414,6 +414,9 @@ class DirectEnv(VecEnv):
         own = {
             f"task.{name}": value for name in _BUFFERS if isinstance(value := getattr(self.task, name, None), Tensor)
         }
+        flags = state.get("task.reset_buf")
+        if flags is not None and not flags.is_complex():  # `self.reset_buf = fallen` replaces the integers by booleans
+            own["task.reset_buf"] = own["task.reset_buf"].to(flags.dtype)
         require_matching_tensors(state, {**own, "_returns": self._returns, "_fresh": self._fresh}, "env: workflow")
         self._returns.copy_(state["_returns"])
         self._fresh.copy_(state["_fresh"])
@@ -422,7 +425,7 @@ class DirectEnv(VecEnv):
 
 
 _BUFFERS = ("obs_buf", "states_buf", "rew_buf", "reset_buf", "progress_buf")
-"""Buffers that the environment loop reads. Only their shapes are checked when a checkpoint is loaded."""
+"""Buffers that the environment loop reads. Their shapes and types are checked when a checkpoint is loaded."""
 
 
 def _symmetric(bound: float | None) -> tuple[float, float] | None:

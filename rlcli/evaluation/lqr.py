@@ -101,7 +101,7 @@ def regulator(resolved: Resolved, bound: float | None) -> Regulator:
     gain = riccati(a, b, np.eye(nx), np.eye(b.shape[1]) / (bound or 1.0) ** 2)
     poles = tuple(sorted(np.abs(np.linalg.eigvals(a - b @ gain)).tolist(), reverse=True)) if gain is not None else ()
     if gain is None or poles[0] >= 1.0:
-        raise _no_regulator_error(resolved, "no linear feedback stabilizes its default state")
+        raise _no_regulator_error(resolved, "no linear feedback stabilizes the default state")
     return Regulator(gain @ decoder.T, rest, bound, poles)
 
 
@@ -154,13 +154,13 @@ def _sample_steps(env: VecEnv, resolved: Resolved) -> tuple[Matrix, Matrix, Matr
     env.sim.forward_moved()
     step = env.step(both[:, 2 * nv :].float())
     if bool((step.terminated | step.truncated).any()):
-        raise _no_regulator_error(resolved, "its default state ends an episode")
+        raise _no_regulator_error(resolved, "the default state ends an episode")
     after = torch.cat([qpos - middle, qvel], dim=1).double().cpu().numpy()
     observed = step.obs["policy"].double().cpu().numpy()
     if np.abs(after[0]).max() > _MAX_DRIFT:
         moved = _coordinates(env)[int(np.abs(after[0]).argmax())]
         contacts = _contacts(env)
-        why = f"its default state is not an equilibrium: {moved} moves"
+        why = f"the default state is not an equilibrium: {moved} moves"
         if contacts:
             why += f" (contacts there: {contacts})"
         rest = "set scene.entities.NAME.init.joint_pos to a pose at rest, as `rlcli play TASK --policy zero` shows it"
@@ -169,7 +169,7 @@ def _sample_steps(env: VecEnv, resolved: Resolved) -> tuple[Matrix, Matrix, Matr
         raise _no_regulator_error(resolved, why, f"{rest}; or use --policy trained, zero or random")
     success = env.compute_success()
     if success is None or not bool(success[0]):
-        raise _no_regulator_error(resolved, "it does not succeed at its default state")
+        raise _no_regulator_error(resolved, "the regulator does not succeed at the default state")
     half = [(values[2 : 2 + pairs] - values[2 + pairs :]) / 2 for values in (after, observed)]
     return drawn, half[0], half[1], observed[0]
 

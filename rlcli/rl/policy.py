@@ -44,6 +44,7 @@ class PolicySpec(BaseModel):
     kind: Literal["gaussian-mlp", "gaussian-lstm", "gaussian-cnn", "squashed-gaussian-mlp", "deterministic-mlp"] = (
         "gaussian-mlp"
     )
+    """Kind of the policy, one of the list above."""
     group: Annotated[str, Field(max_length=200)] = "policy"
     """Observation group that the policy reads."""
     observation_size: Width

@@ -1,5 +1,6 @@
 """Find the task and configuration of a saved run, for `play`, `eval`, `train --resume` and other commands."""
 
+import logging
 import os
 import shlex
 from collections.abc import Mapping
@@ -13,6 +14,9 @@ from rlcli.registry import TASKS, TaskSource, find_entry, folder_task, installed
 from rlcli.runs import trusted_tasks
 from rlcli.runs.run import Run
 from rlcli.runs.safe_io import read_errors, require_inside
+from rlcli.safe_text import shorten
+
+_log = logging.getLogger(__name__)
 
 
 def source_of(run: Run, named: TaskSource | None = None) -> TaskSource:
@@ -59,6 +63,11 @@ def recorded_task(
                 return named
         is_gone = not record.get("python") and not Path(str(record["folder"])).exists()
         if named is not None and (named.distribution is None or is_gone):
+            if named.distribution is not None:
+                _log.warning(
+                    "%s is not on this machine (%s); the task '%s' of %s is used instead",
+                    what, shorten(record["folder"], 100), named.name, named.distribution,
+                )  # fmt: skip
             return named
         if not trusted_tasks.is_known(record):
             raise _untrusted_code_error(record, what, run)
@@ -76,7 +85,8 @@ def recorded_task(
             known = f"{error.hint}; " if error.hint else ""
             known += f"if the task was moved, name its new place: rlcli eval {moved} --checkpoint {word}"
         hint = f"if you trust its authors, install {owner}{version}" if owner else known
-        raise TaskError(f"{what} is not installed: {error.message}", hint=hint) from None
+        state = "is not installed" if owner else "was not found"
+        raise TaskError(f"{what} {state}: {error.message}", hint=hint) from None
 
 
 def _untrusted_code_error(record: Mapping[str, Any], what: str, run: str | None) -> CheckpointError:

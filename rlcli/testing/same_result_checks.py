@@ -108,12 +108,10 @@ def checkpoint(subject: TaskUnderTest) -> Iterator[Finding]:
         hint = f"no checkpoint can hold {', '.join(unsaved)}; {hint}"
     hint += "; else a resumed run differs from a run without interruption"
     message = "this output of the step differs after saving and restoring"
-    for begins in (True, False):  # a state that is not saved may by chance be right at a start, or after some steps
+    for steps in (0, 3):  # a state that is not saved may by chance be right before any step, or after some
         other.reset(seed=subject.seed + 1)
-        for action in actions[:3]:
+        for action in actions[:steps]:
             other.step(action.clone())
-        if begins:
-            other.reset(seed=subject.seed + 1)
         again = {f"observation '{group}'": values.clone() for group, values in other.load_state_dict(saved).items()}
         found = list(compare_trajectories(env, [original, [again, *_continue(other, actions[7:])]], message, hint))
         yield from found

@@ -229,7 +229,9 @@ def _layers(weights: Mapping[str, Tensor], prefix: str, file: Path) -> list[_Lay
     numbers = {n.removeprefix(prefix).partition(".")[0] for n in weights if n.startswith(prefix)}
     if not all(number.isdecimal() and number.isascii() and len(number) < 4 for number in numbers):
         found = ", ".join(sorted(numbers))[:200]
-        raise CheckpointError(f"{file}: the layers {prefix}* are named {found}; name them 0, 2, 4, ...")
+        raise CheckpointError(
+            f"{file}: the layers {prefix}* are named {found}; rename them to {prefix}0, {prefix}2, {prefix}4, ..."
+        )
     if sorted(map(int, numbers)) != list(range(0, 2 * len(numbers), 2)):
         found = ", ".join(sorted(numbers, key=int))[:200]
         raise CheckpointError(f"{file}: only linear layers {prefix}0, 2, 4, ... can be imported, found {found}")

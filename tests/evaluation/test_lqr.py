@@ -90,7 +90,7 @@ def test_regulator_balances_the_cartpoles(name):
     ("overrides", "more", "output"),
     [
         (["success.slide=null"], "", "defines no condition of success"),
-        (["success.slide.target=1.0"], "", "does not succeed at its default state"),
+        (["success.slide.target=1.0"], "", "does not succeed at the default state"),
         (["observations.policy.pos=null"], "", "do not determine the state: slide"),
         (["observations.policy.vel=null", "observations.policy.pos.history=1"], "", "the velocity of slide"),
         ([], '<body name="ball" pos="0 0 1"><joint type="ball"/><geom size="0.1"/></body>', "a ball joint"),

@@ -20,17 +20,6 @@ from rlcli.scene import untrusted_mjcf
 from rlcli.scene.mjcf_safety_check import BadModel, MjcfScan
 from rlcli.scene.untrusted_mjcf import check_mjcf, read_mjcf
 
-TASK = """
-summary: A block.
-decimation: 1
-episode_length_s: 0.05
-sim: {dt: 0.01}
-scene: {num_envs: 2, entities: {robot: {model: model.xml}}}
-actions: {effort: {func: joint_effort, joints: [slide]}}
-observations: {policy: {pos: {func: joint_pos}}}
-rewards: {alive: {func: is_alive, weight: 1.0}}
-terminations: {time_out: {func: time_out, time_out: true}}
-"""
 BLOCK = '<body name="block"><joint name="slide" type="slide"/><geom type="box" size="0.3 0.3 0.3" mass="1"/></body>'
 
 
@@ -281,7 +270,7 @@ def task(tmp_path):
     """A task folder with links, pipes and other traps in it and beside it."""
     folder = tmp_path / "task"
     (folder / "parts").mkdir(parents=True)
-    (folder / "task.yaml").write_text(TASK)
+    (folder / "task.yaml").write_text(mjcf_grammar.TASK)
     (folder / "notes.txt").write_text("<mujoco/>")
     (folder / "bin.mjb").write_bytes(b"\0" * 100)
     (folder / "huge.png").write_bytes(png(2_000_000, 2_000_000))
@@ -323,7 +312,7 @@ def test_validate_exits_3_for_a_bad_model(task, capsys, monkeypatch):
 
 
 def test_compiled_model_is_not_opened(task):
-    (task / "task.yaml").write_text(TASK.replace("model.xml", "bin.mjb"))
+    (task / "task.yaml").write_text(mjcf_grammar.TASK.replace("model.xml", "bin.mjb"))
     with pytest.raises(ConfigError, match=r"compiled models \(.mjb\) are not opened"):
         make_env(resolve(folder_task(task)))
 
@@ -335,7 +324,7 @@ def test_files_of_task_package_and_links_are_opened(tmp_path):
     (package / "common").mkdir()
     for place in (package, folder):
         (place / "__init__.py").touch()
-    (folder / "task.yaml").write_text(TASK)
+    (folder / "task.yaml").write_text(mjcf_grammar.TASK)
     (package / "common" / "floor.xml").write_text('<mujoco><worldbody><geom size="1"/></worldbody></mujoco>')
     (folder / "parts" / "eye.xml").write_text('<mujoco><worldbody><site name="eye"/></worldbody></mujoco>')
     linked(folder, "light.xml", folder / "parts" / "light.xml")
@@ -451,7 +440,7 @@ def several(task, count, text, name="o.xml"):
     (task / "model.xml").write_text(model())
     (task / name).write_text(text)
     entities = "".join(f", r{i}: {{model: {name}}}" for i in range(count))
-    (task / "task.yaml").write_text(TASK.replace("model.xml}", "model.xml}" + entities))
+    (task / "task.yaml").write_text(mjcf_grammar.TASK.replace("model.xml}", "model.xml}" + entities))
     return resolve(folder_task(task))
 
 

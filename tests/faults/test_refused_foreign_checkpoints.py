@@ -297,7 +297,10 @@ def test_repeated_tensor_does_not_fill_the_memory(monkeypatch):
         ({"actor.0.weight": torch.zeros(1, 4), "actor.0.bias": torch.zeros(3)}, "use linear layers with a bias"),
         ({"actor.0.weight": torch.zeros(1, 4), "actor.0.bias": torch.zeros(1)}, "depends on the state"),
         ({"actor.1.weight": torch.zeros(1, 4), "actor.1.bias": torch.zeros(1)}, "can be imported, found 1"),
-        ({"actor.x.weight": torch.zeros(1, 4), "actor.x.bias": torch.zeros(1)}, "are named x; name them 0, 2, 4"),
+        (
+            {"actor.x.weight": torch.zeros(1, 4), "actor.x.bias": torch.zeros(1)},
+            "are named x; rename them to actor.0, actor.2, actor.4",
+        ),
         ({"actor.00.weight": torch.zeros(1, 4), "actor.0.weight": torch.zeros(1, 4)}, "actor"),
         ({"actor.0.weight": torch.zeros(1, 4), "actor.0.bias": torch.zeros(1), "std": torch.ones(2)}, "log_std"),
         (

@@ -113,8 +113,10 @@ def test_code_named_by_an_untrusted_run_is_not_executed(kind, name, at, good, cl
     for command, line in commands(at.run, good.run).items():
         message = cli(*line)
         if command == "play latest":
-            # no folder has this name, so that the task of the command line replaces it
-            assert message.code in ((0,) if name == "a home folder" else (4, 5)), (command, message.err)
+            if name == "a home folder":  # there is no folder of this name, and the command line names another task
+                assert "is not on this machine (~/evil); the task 'cartpole' of rlcli is used instead" in message.err
+            else:
+                assert message.code in (4, 5), (command, message.err)
         else:
             refused(
                 message, (5,) if kind == "RECORD" and "distribution that c" not in name else (4, 5), "untrusted-run"

@@ -24,17 +24,6 @@ from support import mjcf_grammar, yaml_grammar
 from support.case_runs import in_children
 
 SECONDS, MEMORY, BATCH = 10, 2 * 1024**3, 50
-TASK = """
-summary: A model of the grammar.
-decimation: 1
-episode_length_s: 0.05
-sim: {dt: 0.01}
-scene: {num_envs: 2, entities: {robot: {model: model.xml}}}
-actions: {effort: {func: joint_effort, joints: [slide]}}
-observations: {policy: {pos: {func: joint_pos}}}
-rewards: {alive: {func: is_alive, weight: 1.0}}
-terminations: {time_out: {func: time_out, time_out: true}}
-"""
 CODES = (0, 2, 3, 4, 7, 8)
 
 
@@ -55,7 +44,7 @@ def yaml_case(seed, originals):
 
 def mjcf_case(seed, _):
     """Write a task with a drawn model; return the same as `yaml_case`."""
-    Path("task/task.yaml").write_text(TASK)
+    Path("task/task.yaml").write_text(mjcf_grammar.TASK)
     return ["--deep"], mjcf_grammar.write(seed, Path("task")), CODES
 
 
@@ -95,7 +84,7 @@ def run(seed, numbers, start):
     Path("task").mkdir()
     Path("task/model.xml").write_text(mjcf_grammar.RICH)
     Path("task/part.xml").write_text(mjcf_grammar.PART)
-    Path("task/task.yaml").write_text(TASK)
+    Path("task/task.yaml").write_text(mjcf_grammar.TASK)
     found = validate("--deep")  # imports every module, so that the children do not
     assert found[0] == 0, found
     originals = yaml_grammar.documents()

@@ -19,6 +19,18 @@ from rlcli.scene.mjcf_safety_check import BadModel
 from rlcli.scene.untrusted_mjcf import read_mjcf
 from support.case_runs import in_children
 
+TASK = """
+summary: A block on a slide.
+decimation: 1
+episode_length_s: 0.05
+sim: {dt: 0.01}
+scene: {num_envs: 2, entities: {robot: {model: model.xml}}}
+actions: {effort: {func: joint_effort, joints: [slide]}}
+observations: {policy: {pos: {func: joint_pos}}}
+rewards: {alive: {func: is_alive, weight: 1.0}}
+terminations: {time_out: {func: time_out, time_out: true}}
+"""
+"""Task file for a robot with a joint `slide` in `model.xml`."""
 RICH = """
 <mujoco model="rich">
   <compiler autolimits="true"><lengthrange/></compiler>

@@ -86,9 +86,12 @@ def task(tmp_path, monkeypatch):
         folder = Path("memories")
         folder.mkdir()
         (folder / "model.xml").write_text(MODEL)
-        if kind == "direct":
+        if kind != "managed":
+            code = DIRECT.replace("# MORE", more)
+            if kind == "direct with boolean flags":
+                code = code.replace("self.reset_buf[:] = 0", "self.reset_buf = self.obs_buf[:, 1] > 0.85")
             (folder / "task.yaml").write_text(YAML)
-            (folder / "task.py").write_text(DIRECT.replace("# MORE", more))
+            (folder / "task.py").write_text(code)
         else:
             (folder / "task.yaml").write_text(MANAGED)
             (folder / "terms.py").write_text(TERMS)
@@ -106,7 +109,7 @@ def rows(run):
     return kept, sorted(run.glob("checkpoints/*/policy.safetensors"))[-1].read_bytes()
 
 
-@pytest.mark.parametrize("kind", ["direct", "managed"])
+@pytest.mark.parametrize("kind", ["direct", "direct with boolean flags", "managed"])
 def test_python_state_of_task_is_resumed_exactly(task, kind, capsys):
     folder = task(kind)
     train(folder, "--name", "whole", "--max-iterations", "6")

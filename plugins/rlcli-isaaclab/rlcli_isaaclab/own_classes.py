@@ -60,4 +60,4 @@ def warn_of_methods(what: str, kind: Any, only: Collection[str] = ()) -> str:
 def note_own_class(item: Node, kind: str) -> None:
     """Note that an asset or sensor of a task's own class is read as Isaac Lab's class `kind`."""
     methods = warn_of_methods(".".join(item.key), item.data["class_type"])
-    item.note("approximated", "class_type", f"read as a {kind}; {methods or 'the class has no methods'}")
+    item.note("approximated", "class_type", f"read as {kind}; {methods or 'the class has no methods'}")

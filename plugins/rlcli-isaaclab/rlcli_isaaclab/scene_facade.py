@@ -21,7 +21,10 @@ from rlcli_isaaclab.sensor_facade import FrameTransformer, TerrainImporter, boun
 from rlcli_isaaclab.sensor_reader import filter_name
 from rlcli_isaaclab.setup_scene import current_setup
 
-_OWN_CLASS = "if a class of the task defines it: rlcli does not run methods of own asset classes; compute it in a term"
+_OWN_CLASS = (
+    "if an asset class of your task defines this attribute, compute the value in a term:"
+    " rlcli does not run methods of a task's asset classes"
+)
 
 
 class Asset:
@@ -252,8 +255,9 @@ class Asset:
                 f"the base of '{self._entity.name}' is fixed in its MJCF, and the task moves it",
                 hint='add <freejoint/> to its body in the MJCF, or mocap="true" if only a reset moves it',
             )
-        cosine = (root_pose[:, 3:] * self.data.root_quat_w[rows]).sum(dim=1).abs()
-        if bool((cosine < 1.0 - 1e-4).any()):
+        turned = torch.nn.functional.normalize(root_pose[:, 3:])
+        cosine = (turned * self.data.root_quat_w[rows]).sum(dim=1).abs()  # of half the angle
+        if not bool((cosine > 1.0 - 1e-6).all()):
             name = self._entity.name
             report_once(f"the base of '{name}' is fixed in its MJCF: the orientation that the task sets is ignored")
 

@@ -41,7 +41,7 @@ class MoonCfg(TerrainImporterCfg):
     stepped(resolved)
     status, why = note_of(resolved, "scene.ground.class_type")
     assert status == "approximated"
-    assert why.startswith("read as a TerrainImporter; ")
+    assert why.startswith("read as TerrainImporter; ")
     assert why.endswith("rover_env.py:15: scene.ground: rlcli does not run the method __init__ of the class Moon")
 
 
@@ -88,7 +88,7 @@ class GaugeCfg({base}Cfg):
     assert "gauge" in env.sensors
     status, why = note_of(resolved, "scene.gauge.class_type")
     assert status == "approximated"
-    assert why.startswith(f"read as a {base}; ")
+    assert why.startswith(f"read as {base}; ")
     assert why.endswith("scene.gauge: rlcli does not run the method _update_buffers_impl of the class Gauge")
 
 

@@ -101,14 +101,14 @@ def test_methods_of_an_own_asset_class_are_named_and_a_term_that_needs_them_stop
         resolved = rover(tmp_path / "rover", OWN_ASSET, [own], rewards=reward)
     (note,) = [note for note in resolved.notes if note.key == "scene.robot.class_type"]
     assert "scene.robot: rlcli does not run the method update of the class Remembers" in note.text
-    assert note.text.split(": read as")[0].startswith("read as a Articulation; ")
+    assert note.text.split(": read as")[0].startswith("read as Articulation; ")
     assert "rover_env.py:" in next(record.getMessage() for record in caplog.records)
     with pytest.raises(AttributeError, match="no private attribute '_last'") as found:
         stepped(resolved)
     error = error_of_task(found.value)
     assert isinstance(error, TaskError)
     assert "rover_env.py:" in error.message
-    assert "rlcli does not run methods of own asset classes" in error.hint
+    assert "rlcli does not run methods of a task's asset classes" in error.hint
 
 
 def test_an_asset_can_be_asked_for_members_that_it_lacks(tmp_path):

@@ -128,7 +128,7 @@ def test_single_episode_has_no_interval(cli, coin):
     done = cli(*arguments, "--fail-under", "return.low=0")
     assert "unknown" in done.out
     assert done.code == 9
-    assert "return.low is unknown, because there are fewer than two episodes" in done.err
+    assert "return.low is unknown, because there are fewer than two episodes or values that are not finite" in done.err
 
 
 def test_evaluation_is_saved_in_run(cli, trained):
