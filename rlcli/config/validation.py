@@ -14,7 +14,6 @@ from rlcli.config.layers import Layers, Origin, document_origins, override_place
 from rlcli.config.model_option import MODELS, OPTIONAL, given_settings, model_path
 from rlcli.config.older_success import upgraded
 from rlcli.config.other_framework_keys import foreign_keys, merge_translation, move_foreign_keys
-from rlcli.config.possible_success import impossible_conditions
 from rlcli.config.schema import AgentConfig, TaskConfig, TermConfig
 from rlcli.config.strict_yaml import Document, Path
 from rlcli.config.term_signatures import (
@@ -332,9 +331,7 @@ class TaskCheck:
             self._require_direct(data)
         if self.problems or not isinstance(task, TaskConfig):
             return None
-        task = with_terms(task, terms, params)
-        self.add(*impossible_conditions(task, self.layers))
-        return task
+        return with_terms(task, terms, params)
 
     def _validate(self, model: type[BaseModel], data: Any, at: Path) -> BaseModel | None:
         """Validate the data at a path with a model; if the data are not valid, add the problems and return None."""

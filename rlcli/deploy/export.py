@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from rlcli.deploy import file_formats as formats
-from rlcli.deploy.deployed_policy import DeployedPolicy
+from rlcli.deploy.exported_module import DeployedPolicy
 from rlcli.deploy.file_formats import FORMATS, PolicyFunction, require_self_contained
 from rlcli.deploy.metadata import metadata_of, mjlab_properties
 from rlcli.errors import MachineError, UsageError, VerdictError, require_known

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from rlcli.deploy.deployed_policy import DeployedPolicy
+from rlcli.deploy.exported_module import DeployedPolicy
 from rlcli.deploy.numpy_export import numpy_bytes, read_numpy
 from rlcli.errors import CheckpointError, DependencyError, pip_install
 from rlcli.machine.memory import require_address_space

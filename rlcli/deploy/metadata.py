@@ -6,7 +6,7 @@ A program that runs the policy reads this metadata. ONNX files also have the met
 from collections.abc import Sequence
 from typing import Any
 
-from rlcli.deploy.deployed_policy import DeployedPolicy
+from rlcli.deploy.exported_module import DeployedPolicy
 from rlcli.errors import listing
 from rlcli.runs.checkpoint_reader import Checkpoint
 from rlcli.runs.layout_and_deployment import ActionColumns, DeploymentRecord, LayoutRecord, ObservationColumns

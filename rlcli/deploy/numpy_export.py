@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rlcli.deploy.deployed_policy import DeployedPolicy
+from rlcli.deploy.exported_module import DeployedPolicy
 
 _TEMPLATE = Path(__file__).parent / "deployed" / "policy.py"
 

@@ -134,9 +134,11 @@ class Environment(Protocol):
         The values describe the state before resets; evaluations and `StepObserver.on_step` read them. The metrics of
         command terms are in `Episodes.metrics`.
         """
+        return {}
 
     def reset_metrics(self) -> dict[str, Tensor]:
         """Return the values that a task logged about the episodes that ended in this step, by name. (num_envs,) each"""
+        return {}
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return copies of everything that the next steps depend on; call it between two steps."""
@@ -151,12 +153,14 @@ class Environment(Protocol):
 
     def unsaved_state(self) -> list[str]:
         """Return the names of attributes that `state_dict` cannot save; if there are none, a resumed run is exact."""
+        return []
 
     def stateful_objects(self) -> list[Any]:
         """Return the objects whose attributes a step may change: terms that are classes, or the direct task.
 
         A CUDA graph of the step must include these attributes.
         """
+        return []
 
     def episode_dependencies(self) -> list[str]:
         """Return the parts of the configuration that make an episode depend on earlier ones, such as `scene.terrain`.

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -117,30 +116,10 @@ class Workflow(Environment):
     def _load_workflow_state(self, state: Mapping[str, Tensor]) -> None:
         """Restore the state returned by `_workflow_state`."""
 
-    def stateful_objects(self) -> list[Any]:
-        """Return the objects whose attributes a step may change: terms that are classes, or the direct task."""
-        return []
-
     def episode_dependencies(self) -> list[str]:
         """Return parts of the configuration that make an episode depend on earlier ones, such as `scene.terrain`."""
         terrain = ["scene.terrain"] if self.terrain is not None else []
         return terrain + (["keep_state_at_reset"] if self.config.keep_state_at_reset else [])
-
-    def step_metrics(self) -> dict[str, Tensor]:
-        """Return the values that a direct task wrote to `extras` in this step, by name. (num_envs,) each
-
-        The values describe the state before resets; evaluations and `StepObserver.on_step` read them. The metrics of
-        command terms are in `Episodes.metrics`.
-        """
-        return {}
-
-    def reset_metrics(self) -> dict[str, Tensor]:
-        """Return the values that a task logged about the episodes that ended in this step, by name. (num_envs,) each"""
-        return {}
-
-    def unsaved_state(self) -> list[str]:
-        """Return the names of attributes that `state_dict` cannot save; if there are none, a resumed run is exact."""
-        return []
 
     def markers(self) -> list[Marker]:
         """Return the shapes that viewers show beside the bodies. Only viewers call this method."""

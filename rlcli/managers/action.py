@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from rlcli.errors import ConfigError
-from rlcli.managers.observation_pipeline import Delay, make_delay
+from rlcli.managers.observation_stages import Delay, make_delay
 from rlcli.managers.term_binding import BoundTerm, EnvContext, resets
 from rlcli.sim.env_selection import Selection, in_place
 from rlcli.sim.saved_tensors import TensorState

@@ -14,7 +14,8 @@ import torch
 from torch import Tensor
 
 from rlcli.config.schema import ObservationGroupConfig
-from rlcli.managers.observation_pipeline import Draws, Pipeline
+from rlcli.managers.observation_pipeline import Pipeline
+from rlcli.managers.observation_stages import Draws
 from rlcli.managers.term_binding import BoundTerm, EnvContext, first_value
 from rlcli.sim.env_selection import Selection
 from rlcli.sim.saved_tensors import TensorState

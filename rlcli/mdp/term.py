@@ -1,7 +1,8 @@
 """Base classes of terms that are dataclasses. Their fields are the keys of the term in the YAML.
 
-Among several base classes, a term lists JointTerm, GeomTerm or another class of this module last: a dataclass collects
-the fields of its last base first, so `entity` and the selected elements become the first keys.
+Among several base classes with fields, a term lists JointTerm, GeomTerm or another class of this module last: a
+dataclass collects the fields of its last base first, so `entity` and the selected elements become the first keys.
+`TensorState` has no fields and stands after them: `class MyTerm(RangeKeys, JointTerm, TensorState)`.
 """
 
 from __future__ import annotations

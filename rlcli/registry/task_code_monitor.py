@@ -31,6 +31,8 @@ _SAMPLE_S = 1.0
 _MOST_TEXT = 200
 """Largest length of a reported warning [characters]; longer warnings are cut."""
 _monotonic = time.monotonic  # the thread `_Watch` needs it even if a task deletes or replaces it
+_GROUPS = (FORMATS, TRAINERS, TASKS)
+"""Groups of the entry points of plugins."""
 _ENTRIES = ("rlcli.cli.app", "rlcli.envs.sharding.worker")
 """Modules that start a command or a worker. Frames outside of them belong to the program that called rlcli."""
 
@@ -46,9 +48,11 @@ def error_of_task(error: BaseException) -> TaskError | None:
         return None
     frame, line = next((each for each in reversed(found) if not _is_from_string(each[0])), found[-1])
     hint = getattr(error, "hint", None)
+    plugin = None if _plugin(frame, (TASKS,)) else _plugin(frame)
+    whose = "task's code" if plugin is None else f"code of the plugin {plugin.distribution} {plugin.version}"
     return TaskError(
         f"{_place(frame, line)}: {frame.f_code.co_name}: {short_error(error)}",
-        hint=hint if isinstance(hint, str) else "correct the task's code at this line; --debug shows the traceback",
+        hint=hint if isinstance(hint, str) else f"correct the {whose} at this line; --debug shows the traceback",
     )
 
 
@@ -120,13 +124,18 @@ def _module(frame: FrameType) -> str:
     return str(frame.f_globals.get("__name__", ""))
 
 
-def _plugin(frame: FrameType) -> Entry | None:
-    """Return the entry point of the installed plugin whose package has the code of a frame; None for other code."""
-    return _plugins().get(_module(frame).partition(".")[0])
+def _plugin(frame: FrameType, groups: tuple[str, ...] = _GROUPS) -> Entry | None:
+    """Return the entry point of the installed plugin whose package has the code of a frame; None for other code.
+
+    Args:
+        frame: the frame.
+        groups: the groups of entry points to search.
+    """
+    return _plugins(groups).get(_module(frame).partition(".")[0])
 
 
 @functools.cache
-def _plugins(groups: tuple[str, ...] = (FORMATS, TRAINERS, TASKS)) -> dict[str, Entry]:
+def _plugins(groups: tuple[str, ...] = _GROUPS) -> dict[str, Entry]:
     """Return the top-level packages of installed plugins, each with one of its entry points."""
     with contextlib.suppress(Exception):  # without readable metadata, installed plugins count as libraries
         return {entry.package: entry for group in groups for entry in catalog(group, hidden=True)[0]}
@@ -394,7 +403,7 @@ def _calls(frames: Iterable[FrameType]) -> Iterator[FrameType]:
         if frame is not None and (is_task_code(frame) or (plugin is not None and plugin.distribution != OWN)):
             inner = frame
         elif inner is not None and (frame is None or is_framework(_module(frame))):
-            is_trainer = _module(inner).partition(".")[0] in _plugins((TRAINERS,))
+            is_trainer = _plugin(inner, (TRAINERS,)) is not None
             if not is_trainer or inner.f_code.co_name == "<module>":
                 yield inner
             inner = None

@@ -146,7 +146,7 @@ def read_history(run: Run) -> History:
     columns: dict[str, array[float]] = {}
     axes: dict[str, array[float]] = {name: array("d") for name in AXES}
     elapsed, last = 0.0, (0, 0)
-    for row in read_rows(run):
+    for row in read_rows(run.metrics):
         current = (row["iteration"], row["step"])
         if not all(before < now < 2**62 for before, now in zip(last, current, strict=True)):
             what = f"iteration {current[0]}, step {current[1]} after iteration {last[0]}, step {last[1]}"

@@ -6,10 +6,10 @@ The file may be untrusted, and a killed process may leave an incomplete last row
 import json
 import logging
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 from rlcli.errors import CheckpointError
-from rlcli.runs.run import Run
 from rlcli.runs.safe_io import read_errors
 
 _log = logging.getLogger(__name__)
@@ -20,13 +20,13 @@ _LARGEST = 1e300
 """Largest absolute value of a metric; larger numbers are ignored, because such an integer cannot become a float."""
 
 
-def read_rows(run: Run, *, strict: bool = False) -> Iterator[dict[str, Any]]:
-    """Yield the rows of a run's metrics as metric -> number, the oldest first; nothing if there is no file.
+def read_rows(file: Path, *, strict: bool = False) -> Iterator[dict[str, Any]]:
+    """Yield the rows of a `metrics.jsonl` as metric -> number, the oldest first; nothing if there is no file.
 
     An incomplete last line, as a killed process leaves one, is skipped.
 
     Args:
-        run: the run.
+        file: the file.
         strict: raise an error at a corrupt line; if false, log a warning, and leave out the line and all later ones.
 
     Raises:
@@ -34,22 +34,20 @@ def read_rows(run: Run, *, strict: bool = False) -> Iterator[dict[str, Any]]:
     """
     size = 0
     try:
-        with read_errors(run.metrics), run.metrics.open("rb") as file:
-            for number, line in enumerate(iter(lambda: file.readline(LONGEST_LINE), b""), start=1):
+        with read_errors(file), file.open("rb") as lines:
+            for number, line in enumerate(iter(lambda: lines.readline(LONGEST_LINE), b""), start=1):
                 size += len(line)
                 if size > _MOST_BYTES:
-                    raise CheckpointError(f"{run.metrics} is larger than {_MOST_BYTES:,} bytes; delete old lines")
-                if not line.endswith(b"\n") and len(line) < LONGEST_LINE:
-                    return
+                    raise CheckpointError(f"{file} is larger than {_MOST_BYTES:,} bytes; delete old lines")
                 row = parse_row(line)
                 if row is not None:
                     yield row
+                elif not line.endswith(b"\n") and len(line) < LONGEST_LINE:
+                    return
                 elif strict:
-                    raise CheckpointError(f"{run.metrics}:{number} is corrupt: not a row of metrics; delete this line")
+                    raise CheckpointError(f"{file}:{number} is corrupt: not a row of metrics; delete this line")
                 else:
-                    _log.warning(
-                        "%s:%d is not a row of metrics; the rows from there on are left out", file.name, number
-                    )
+                    _log.warning("%s:%d is not a row of metrics; the rows from there on are left out", file, number)
                     return
     except FileNotFoundError:
         return

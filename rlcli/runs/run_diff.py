@@ -69,7 +69,7 @@ def last_iteration(run: Run) -> int:
     Raises:
         CheckpointError: if metrics.jsonl has a corrupt line.
     """
-    return max((row["iteration"] for row in read_rows(run, strict=True)), default=0)
+    return max((row["iteration"] for row in read_rows(run.metrics, strict=True)), default=0)
 
 
 def _environments(left: Run, right: Run) -> Section:
@@ -104,7 +104,7 @@ def _metrics(left: Run, right: Run, until: int | None) -> Section:
 
 def _rows(run: Run, until: int | None) -> Iterator[dict[str, Any]]:
     """Return the rows of a run's metrics up to the environment step `until`; all rows if it is None."""
-    rows = read_rows(run, strict=True)
+    rows = read_rows(run.metrics, strict=True)
     return rows if until is None else takewhile(lambda row: row["step"] <= until, rows)
 
 

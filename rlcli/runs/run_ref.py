@@ -18,19 +18,20 @@ from rlcli.settings import setting
 _log = logging.getLogger(__name__)
 
 
-def find_run(reference: str, runs_dir: Path, task: str | None = None) -> tuple[Run, str]:
+def find_run(reference: str, runs_dir: Path, task: str | None = None, *, with_policy: bool = False) -> tuple[Run, str]:
     """Find a run by its folder, its name, or `latest`; return the run and the reason for the choice, as text.
 
     Args:
         reference: the folder, the name, or `latest` (the run that was started last).
         runs_dir: the folder of runs.
         task: name of the task that the run must have; None: any.
+        with_policy: whether `latest` skips runs that ended before they had a trained policy, with a warning.
 
     Raises:
         CheckpointError: if there is no such run.
         UsageError: if the run is of another task than `task`.
     """
-    run, why = _find_run(reference, runs_dir, task)
+    run, why = _find_run(reference, runs_dir, task, with_policy)
     if task is not None and not is_same_task(run.record["task"]["name"], task):
         raise UsageError(f"{run.folder} is a run of {run.record['task']['name']}, not of {task}", hint="leave out TASK")
     return run, why
@@ -129,7 +130,8 @@ def find_checkpoint(
 ) -> tuple[Run, Path, str]:
     """Find a checkpoint by `RUN`, `RUN@best`, `RUN@step:N`, `latest` or its folder.
 
-    `RUN` and `latest` stand for the newest valid checkpoint of the run.
+    `RUN` and `latest` stand for the newest valid checkpoint of the run. If only the policy is needed, `latest` skips
+    runs that ended before they had a trained policy.
 
     Args:
         reference: the reference.
@@ -150,7 +152,7 @@ def find_checkpoint(
     if os.path.isfile(folder / "manifest.json"):  # Path.is_file raises an error for a name that is too long
         return open_run(folder.resolve().parent.parent), folder, "as named"
     name, _, which = (reference, "", "") if os.path.exists(folder) else reference.partition("@")
-    run, why = find_run(name, runs_dir, task)
+    run, why = find_run(name, runs_dir, task, with_policy=not whole)
     have = steps(run.checkpoints)
     if not have:
         message = f"{run.folder} has no complete checkpoint"
@@ -243,7 +245,15 @@ def default_runs_dir() -> Path:
     return Path(os.environ.get("RLCLI_RUNS_DIR") or os.path.expanduser(setting("runs_dir") or "runs"))
 
 
-def _find_run(reference: str, runs_dir: Path, task: str | None) -> tuple[Run, str]:
+def _has_trained_policy(run: Run) -> bool:
+    """Return whether a run has a checkpoint; that of step 0 counts only until the training has ended early."""
+    from rlcli.runs.checkpoint_reader import steps
+
+    have = steps(run.checkpoints)
+    return bool(have) and (have != [0] or run.record.get("state") not in ("failed", "diverged", "stopped"))
+
+
+def _find_run(reference: str, runs_dir: Path, task: str | None, with_policy: bool) -> tuple[Run, str]:
     if reference == "latest":
         runs, refused = _list_runs(runs_dir, task)
         of_task = f" of {task}" if task else ""
@@ -258,13 +268,20 @@ def _find_run(reference: str, runs_dir: Path, task: str | None) -> tuple[Run, st
             raise CheckpointError(f"there is no run{of_task} in {runs_dir.absolute()}", hint=hint)
         # trials of a sweep may be pruned or have poor settings, so they are used only if the user names them
         newest = next((run for run in reversed(runs) if not _is_of_sweep(run)), runs[-1])
+        is_trial = _is_of_sweep(newest)
+        what = "newest trial of a sweep" if is_trial else "newest run"
+        if with_policy and not _has_trained_policy(newest):
+            earlier = (run for run in reversed(runs) if _is_of_sweep(run) == is_trial and _has_trained_policy(run))
+            trained = next(earlier, newest)
+            if trained is not newest:
+                _log.warning(f"{newest.folder} is skipped: it has no trained policy ({newest.record.get('state')})")
+                newest, what = trained, f"{what} with a trained policy"
         if seconds_since(newest.record.get("started")) < -60:
             _log.warning(
                 f"{newest.folder} started in the future by this machine's clock, so that `latest` may not be the run"
                 " that was started last; name the run"
             )
         _warn_of_skipped(refused)
-        what = "newest trial of a sweep" if _is_of_sweep(newest) else "newest run"
         return newest, f"{what} of {task}" if task else f"{what} in {runs_dir}"
     for candidate in (path_of(reference), runs_dir / reference, *([runs_dir / task / reference] if task else [])):
         if os.path.isfile(candidate / RECORD):

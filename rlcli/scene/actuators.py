@@ -1,11 +1,8 @@
-"""Actuator models: PD controllers and DC motors that rlcli, not MuJoCo, computes before each physics step.
-
-Class `JointCommand` writes the commands of action terms, to actuator models or to MuJoCo's own actuators.
-"""
+"""Actuator models: PD controllers and DC motors that rlcli, not MuJoCo, computes before each physics step."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 
 import torch
 from torch import Tensor
@@ -14,7 +11,7 @@ from rlcli.config.schema import ActuatorConfig
 from rlcli.random import stream
 from rlcli.scene.entity import Entity
 from rlcli.scene.initial_state import values_by_joint
-from rlcli.scene.names import NameProblem, match
+from rlcli.scene.names import match
 from rlcli.sim.column_views import as_index
 from rlcli.sim.env_selection import Selection
 from rlcli.sim.saved_tensors import TensorState, require_in_range
@@ -26,7 +23,6 @@ Controller = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
 
 Targets are (num_envs, 3, k), all others (num_envs, k), where k is the number of joints.
 """
-_ROW = {"position": POSITION, "velocity": VELOCITY, "motor": EFFORT}
 
 
 class ActuatorModel(TensorState):
@@ -150,61 +146,3 @@ class ActuatorModel(TensorState):
             "fresh": self._is_first_step,
         }
         return own if self._target_history is None else {**own, "frames": self._target_history, "lag": self._delay}
-
-
-class JointCommand:
-    """Writer of an action term's commands (efforts, positions or velocities) to some joints of a robot.
-
-    The joints are driven by MuJoCo's own actuators or by actuator models of the configuration.
-
-    Args:
-        entity: the robot.
-        kind: motor (efforts), position or velocity.
-        columns: indices of the joints in the robot, in the order of the commands.
-
-    Raises:
-        NameProblem: for a joint without an actuator of this kind.
-    """
-
-    def __init__(self, entity: Entity, kind: str, columns: Sequence[int]) -> None:
-        model, device = entity.engine.model, entity.engine.device
-        modelled = {joint for actuator in entity.actuators for joint in actuator.joints}
-        native = dict(entity.actuators_of(kind))
-        missing = [entity.joint_names[c] for c in columns if c not in modelled and c not in native]
-        if missing:
-            raise NameProblem(f"no {kind} actuator drives {', '.join(missing)}; set actuator: {kind} in scene.entities")
-        self.actuators = [None if c in modelled else native[c] for c in columns]
-        """Id of the MuJoCo actuator of each column; None where an actuator model drives the joint."""
-        self.sinks = [f"{entity.name}/{entity.joint_names[c]} {kind}" if c in modelled else native[c] for c in columns]
-        """Actuator or joint to which each column writes; two action terms must not write to the same one."""
-        sources = [i for i, c in enumerate(columns) if c not in modelled]
-        controls = [native[columns[i]] for i in sources]
-        gear = torch.tensor(model.actuator_gear[controls, 0], dtype=torch.float32, device=device)
-        self._factor = (1.0 / gear if kind == "motor" else gear) if bool((gear != 1.0).any()) else None
-        self._ctrl = entity.engine.field("ctrl")
-        self._sources, self._controls = as_index(sources, device), as_index(controls, device)
-        self._has_native = bool(sources)
-        self._all_native = len(sources) == len(columns)
-        # consecutive controls: a view of the engine's field, made once
-        self._view = self._ctrl[:, self._controls] if sources and isinstance(self._controls, slice) else None
-        self._model_targets = []
-        for actuator in entity.actuators:
-            pairs = [(i, actuator.joints.index(c)) for i, c in enumerate(columns) if c in actuator.joints]
-            if pairs:
-                from_columns, to_joints = (as_index(part, device) for part in zip(*pairs, strict=True))
-                self._model_targets.append((actuator.targets[:, _ROW[kind]], from_columns, to_joints))
-
-    def write(self, command: Tensor) -> None:
-        """Set the commands of the joints, which hold until the next call. command (num_envs, columns)
-
-        Commands are efforts [N or N m], positions [m or rad] or velocities [m/s or rad/s], by the constructor's `kind`.
-        """
-        if self._has_native:
-            own = command if self._all_native else command[:, self._sources]
-            own = own if self._factor is None else own * self._factor
-            if self._view is not None:
-                self._view.copy_(own)
-            else:
-                self._ctrl[:, self._controls] = own.to(self._ctrl.dtype)
-        for targets, from_columns, to_joints in self._model_targets:
-            targets[:, to_joints] = command[:, from_columns]

@@ -16,7 +16,7 @@ import torch
 from rlcli.errors import ConfigError, DependencyError, DeviceError, MachineError, ShapeError, TaskError, require_known
 from rlcli.progress import track, tracked
 from rlcli.runs.atomic_io import write_atomic
-from rlcli.testing import episode_checks, same_result_checks, step_and_file_checks
+from rlcli.testing import episode_checks, file_checks, same_result_checks, step_checks
 from rlcli.testing.findings import Finding, NotRunError, task_error_text
 from rlcli.testing.task_under_test import NUM_ENVS, TaskUnderTest, open_task
 
@@ -26,11 +26,11 @@ OnCheck = Callable[[str, "list[Finding] | None"], None]
 OnNote = Callable[[str, str], None]
 """Function that receives the name of a check and a text that is no finding, such as a measured speed."""
 
-_files, _episodes, _equivalence = step_and_file_checks, episode_checks, same_result_checks
+_steps, _episodes, _equivalence = step_checks, episode_checks, same_result_checks
 _IN_ORDER: tuple[Check, ...] = (
-    *(_files.names, _files.yaml_round_trip, _files.finite, _files.shapes, _files.dtypes),
-    *(_files.random_actions, _files.extreme_actions, _episodes.same_seed, _episodes.start_states),
-    *(_files.constant_columns, _files.aliasing, _episodes.partial_reset, _episodes.final_observations),
+    *(file_checks.names, file_checks.yaml_round_trip, _steps.finite, _steps.shapes, _steps.dtypes),
+    *(_steps.random_actions, _steps.extreme_actions, _episodes.same_seed, _episodes.start_states),
+    *(_steps.constant_columns, _steps.aliasing, _episodes.partial_reset, _episodes.final_observations),
     *(_episodes.truncation, _episodes.termination, _episodes.repeated_observation),
     *(_episodes.observation_after_reset, _episodes.back_fill),
     *(_equivalence.checkpoint, _equivalence.layout, _equivalence.policy, _equivalence.threads),

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 from rlcli.errors import DependencyError, pip_install, require_known
 from rlcli.registry import load_object
 from rlcli.runs.atomic_io import disk_errors, write_atomic
-from rlcli.runs.metric_rows import LONGEST_LINE, parse_row
+from rlcli.runs.metric_rows import read_rows
 from rlcli.runs.run import Run
 
 if TYPE_CHECKING:
@@ -61,9 +61,12 @@ class JsonLines:
     def __init__(self, file: Path, *, resume_after: int | None = None) -> None:
         self._path = file
         with disk_errors(file):
+            rows = [] if resume_after is None else [*read_rows(file)]
+            self.found = (rows[-1]["iteration"], rows[-1]["step"]) if rows else (0, 0)
+            """Iteration and environment steps of the last row that a resumed run found; (0, 0) without a row."""
             if resume_after is not None and file.exists():
-                rows = [row for row in read_metrics(file) if row["iteration"] <= resume_after]
-                write_atomic(file, "".join(json.dumps(row) + "\n" for row in rows))
+                kept = [json.dumps(row) + "\n" for row in rows if row["iteration"] <= resume_after]
+                write_atomic(file, "".join(kept))
             self._file = file.open("a", encoding="utf-8", buffering=1)
 
     def write(self, iteration: int, step: int, metrics: dict[str, float]) -> None:
@@ -158,8 +161,9 @@ def open_loggers(
     from rlcli.training.trackers import FailSafeLogger, open_tracker
 
     iteration, step = resume if resume is not None else (None, None)
-    reached = None if resume is None else max(resume, _last_boundary(run.metrics))
-    loggers: list[Logger] = [JsonLines(run.metrics, resume_after=iteration)]
+    lines = JsonLines(run.metrics, resume_after=iteration)
+    reached = None if resume is None else max(resume, lines.found)
+    loggers: list[Logger] = [lines]
     try:
         for name in names:
             make = load_object(LOGGERS[name].factory)
@@ -175,32 +179,8 @@ def open_loggers(
     return loggers
 
 
-def read_metrics(file: Path) -> list[dict[str, Any]]:
-    """Return the rows of a `metrics.jsonl` (iteration, step and metrics), up to the first damaged row.
-
-    A killed process may leave an incomplete last row.
-    """
-    rows = []
-    with file.open("rb") as lines:
-        for line in iter(lambda: lines.readline(LONGEST_LINE), b""):
-            row = parse_row(line)
-            if row is None:
-                break
-            rows.append(row)
-    return rows
-
-
 def _installed(name: str) -> bool:
     return importlib.util.find_spec(LOGGERS[name].needs) is not None
-
-
-def _last_boundary(file: Path) -> tuple[int, int]:
-    """Return the iteration and the step of the last row of a `metrics.jsonl`; (0, 0) without a row."""
-    try:
-        last = read_metrics(file)[-1]
-    except (OSError, IndexError):
-        return 0, 0
-    return last["iteration"], last["step"]
 
 
 def _remove_events_after(file: Path, step: int) -> None:

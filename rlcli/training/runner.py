@@ -24,13 +24,14 @@ from rlcli.replay.failure_recorder import open_failure_recorder
 from rlcli.rl.budget import Budget
 from rlcli.rl.trainer import Trainer
 from rlcli.runs.checkpoint_reader import steps
+from rlcli.runs.metric_rows import read_rows
 from rlcli.runs.provenance import built_record, differences, environment_record
 from rlcli.runs.recorded_task import resolve_run
 from rlcli.runs.run import Run
 from rlcli.training.checkpoint_writer import CheckpointWriter, KeepRule, manifest_entries
 from rlcli.training.health import Health
 from rlcli.training.job import Job, TrainingResult
-from rlcli.training.loggers import open_loggers, read_metrics
+from rlcli.training.loggers import open_loggers
 from rlcli.training.loop import TrainLoop
 from rlcli.training.periodic_eval import PeriodicEval
 from rlcli.training.progress import Progress
@@ -238,7 +239,7 @@ def _periodic_eval(job: Job, writer: CheckpointWriter, stop: StopRequest, iterat
         env.observers.add(stop)
         return env
 
-    evaluator = PeriodicEval(make, episodes, interval, read_metrics(run.metrics), until)
+    evaluator = PeriodicEval(make, episodes, interval, [*read_rows(run.metrics)], until)
     writer.best = evaluator.best if evaluator.best in steps(run.checkpoints) else None
     # the two differ if the run was killed before it wrote `best`, or is resumed from an earlier step
     if run.record.get("best") != writer.best:
@@ -252,14 +253,14 @@ def _health(job: Job, iterations: int) -> Health | None:
         return None
     agent, _ = job.resolved.require_agent()
     health = Health(job.resolved.task, agent, iterations)
-    for row in read_metrics(job.run.metrics) if job.resume_from is not None else ():
+    for row in read_rows(job.run.metrics) if job.resume_from is not None else ():
         health.add(row["iteration"], {name: value for name, value in row.items() if "/" in name})
     return health
 
 
 def _report_bar(run: Run, bar: str, reached: bool) -> None:
     """Log and record the training time and steps until an evaluation reached `bar`, the threshold of `--until`."""
-    rows = read_metrics(run.metrics)
+    rows = [*read_rows(run.metrics)]
     seconds, step = sum(map(training_s, rows)), rows[-1]["step"] if rows else 0
     run.update(until={"bar": bar, "reached": reached, "seconds": seconds, "step": step})
     if reached:

@@ -17,10 +17,10 @@ from rlcli.config.strict_yaml import MAX_BYTES
 from rlcli.errors import CheckpointError, DivergedError, RlcliError, UsageError
 from rlcli.evaluation.limits import require_success
 from rlcli.progress import track
+from rlcli.runs.metric_rows import read_rows
 from rlcli.runs.overview import newest_rows, overview
 from rlcli.runs.run import CONFIG, Run
 from rlcli.runs.safe_io import read_file
-from rlcli.training.loggers import read_metrics
 from rlcli.training.signals import StopRequest
 from rlcli.training.start_run import TrainingRequest, prepare_run
 from rlcli.training.time_to_threshold import Threshold, TimeToThreshold, median, read_threshold, time_to_threshold
@@ -219,8 +219,7 @@ def _train(
     run = overview(training.folder)
 
     def time_of_run() -> TimeToThreshold | None:
-        metrics = training.folder / "metrics.jsonl"
-        return time_to_threshold(read_metrics(metrics), threshold) if metrics.is_file() else None
+        return time_to_threshold(read_rows(training.folder / "metrics.jsonl"), threshold)
 
     training.reached = time_of_run()
     if training.reached is None and run.state == "diverged":

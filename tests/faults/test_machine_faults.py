@@ -13,8 +13,8 @@ from support.run_comparison import assert_loads, assert_same_run, newest
 
 from rlcli.errors import MachineError
 from rlcli.runs.checkpoint_reader import steps
+from rlcli.runs.metric_rows import read_rows
 from rlcli.runs.run import open_run
-from rlcli.training.loggers import read_metrics
 
 AGENT = """
 agents:
@@ -210,7 +210,7 @@ def test_clock_set_back_changes_nothing(child, uninterrupted, folder):
     ended = child(folder, *TRAIN, faults=back).ended()
     assert ended.code == 0, ended.err
     assert_same_run(run_in(folder), uninterrupted)
-    assert [row["iteration"] for row in read_metrics(run_in(folder) / "metrics.jsonl")] == list(range(1, 9))
+    assert [row["iteration"] for row in read_rows(run_in(folder) / "metrics.jsonl")] == list(range(1, 9))
 
 
 def test_held_lock_raises_machine_error(uninterrupted, tmp_path):

@@ -95,6 +95,26 @@ def test_built_in_tasks_train_without_trainer_plugins(command):
         assert "not checked" in checked.stderr + checked.stdout or "not installed" in checked.stderr + checked.stdout
 
 
+def test_error_of_a_trainer_is_not_the_fault_of_the_task(plugins, mine):
+    source = """
+    from rlcli.config.schema import AgentConfig
+    from rlcli.trainers import TrainerSpec
+
+    class Settings(AgentConfig):
+        lr: float = 1.0
+
+    def trainer(env, config, *, seed, device, torch_threads):
+        raise KeyError("gone")
+
+    SPEC = TrainerSpec(summary="Own.", algorithms={"ppo": "own:Settings"}, trainer="own:trainer")
+    """
+    plugins("own", textwrap.dedent(source), entry_points=POINTS % ("own", "own"))
+    done = train(mine, "own")
+    assert "KeyError" in done.stderr
+    assert "correct the code of the plugin own 1.0 at this line" in done.stderr
+    assert "task's code" not in done.stderr
+
+
 def test_algorithm_mapping_is_selected_by_class_name(plugins, mine):
     source = """
     from typing import Any

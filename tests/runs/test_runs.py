@@ -179,6 +179,33 @@ def test_find_checkpoint_by_run_best_step_and_folder(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("steps", "state", "skipped"),
+    [((), "failed", True), ((), "running", True), ((0,), "failed", True), ((0,), "diverged", True),
+     ((0,), "stopped", True), ((0,), "running", False), ((0,), "finished", False), ((0, 5), "failed", False)],
+)  # fmt: skip
+def test_latest_policy_is_not_of_a_run_that_failed_before_it_was_trained(tmp_path, caplog, steps, state, skipped):
+    old = make_run(tmp_path, steps=(0, 10), state="finished")
+    new = make_run(tmp_path, name="new", steps=steps, state=state)
+    run, _, why = find_checkpoint("latest", tmp_path, "cartpole")
+    assert run.folder == (old if skipped else new).folder
+    assert (f"has no trained policy ({state})" in caplog.text, "with a trained policy" in why) == (skipped, skipped)
+    assert find_run("latest", tmp_path, "cartpole")[0].folder == new.folder
+
+
+def test_latest_checkpoint_to_resume_is_of_the_newest_run(tmp_path):
+    make_run(tmp_path, steps=(0, 10), state="finished")
+    new = make_run(tmp_path, name="new", steps=(0,), state="failed")
+    assert find_checkpoint("latest", tmp_path, "cartpole", whole=True)[0].folder == new.folder
+
+
+def test_latest_policy_of_runs_without_any_is_an_error(tmp_path):
+    make_run(tmp_path, state="failed")
+    make_run(tmp_path, name="new", state="failed")
+    with pytest.raises(CheckpointError, match="new has no complete checkpoint"):
+        find_checkpoint("latest", tmp_path)
+
+
+@pytest.mark.parametrize(
     ("which", "message", "hint"),
     [
         ("@step:7", "no checkpoint at step 7", "steps: 0, 9, 10"),

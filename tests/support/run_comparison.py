@@ -10,8 +10,8 @@ import torch
 from rlcli.replay.failure_cases import FOLDER
 from rlcli.replay.trajectory import read_trajectory
 from rlcli.runs.checkpoint_reader import Checkpoint, open_checkpoint, steps
+from rlcli.runs.metric_rows import read_rows
 from rlcli.runs.run import open_run
-from rlcli.training.loggers import read_metrics
 
 CONSTANT = "Perf/"
 """Prefix of metrics that are times."""
@@ -19,7 +19,7 @@ CONSTANT = "Perf/"
 
 def rows_of(run: Path) -> list[dict[str, Any]]:
     """Return the metrics without times."""
-    return [{k: v for k, v in row.items() if not k.startswith(CONSTANT)} for row in read_metrics(run / "metrics.jsonl")]
+    return [{k: v for k, v in row.items() if not k.startswith(CONSTANT)} for row in read_rows(run / "metrics.jsonl")]
 
 
 def newest(run: Path) -> Checkpoint:

@@ -19,10 +19,11 @@ from rlcli.random import derive
 from rlcli.registry import find_task, load_object
 from rlcli.replay.failure_recorder import open_failure_recorder
 from rlcli.runs.checkpoint_reader import open_checkpoint, steps
+from rlcli.runs.metric_rows import read_rows
 from rlcli.runs.run import Run
 from rlcli.training import loop
 from rlcli.training.checkpoint_writer import CheckpointWriter, KeepRule, drop_after
-from rlcli.training.loggers import JsonLines, read_metrics
+from rlcli.training.loggers import JsonLines
 from rlcli.training.periodic_eval import PeriodicEval
 from rlcli.training.signals import StopRequest
 from support.worlds import CRITTER_TASK, critter, dump
@@ -164,7 +165,7 @@ def train(
     log = JsonLines(record.metrics, resume_after=None if new else trainer.iteration)
     trials = None
     if eval_interval is not None:
-        history = read_metrics(record.metrics)
+        history = [*read_rows(record.metrics)]
         trials = PeriodicEval(lambda: make_env(resolved, seed=77), 3, eval_interval, history)
         saver.best = trials.best
     stop = StopRequest(can_interrupt=True)

@@ -7,11 +7,12 @@ import resource
 import pytest
 
 from rlcli.errors import DependencyError, MachineError, UsageError
-from rlcli.training.loggers import JsonLines, TensorBoard, check_loggers, read_metrics
+from rlcli.runs.metric_rows import read_rows
+from rlcli.training.loggers import JsonLines, TensorBoard, check_loggers
 
 
 def steps_of(file):
-    return [row["step"] for row in read_metrics(file)]
+    return [row["step"] for row in read_rows(file)]
 
 
 def test_json_lines_writes_each_row_at_once(tmp_path):
@@ -45,7 +46,7 @@ def test_resume_removes_later_rows_and_incomplete_row(tmp_path):
 @pytest.mark.parametrize(
     "line", [b"[1]", b'{"a": 1}', b'{"iteration": "1", "step": 1}', b"\xff", b"[" * 100_000, b"\0" * 2**21]
 )
-def test_read_metrics_ends_at_first_damaged_row(tmp_path, line):
+def test_resume_ends_metrics_at_first_damaged_row(tmp_path, line):
     file = tmp_path / "metrics.jsonl"
     good = b'{"iteration": %d, "step": 16}\n'
     file.write_bytes(good % 1 + line + b"\n" + good % 2)

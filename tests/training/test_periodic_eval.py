@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from rlcli.cli.app import main
-from rlcli.training.loggers import read_metrics
+from rlcli.runs.metric_rows import read_rows
 from rlcli.training.periodic_eval import PeriodicEval
 
 SMALL = ("--num-envs", "8", "--logger", "none", "-q", "sim.engine_threads=1", "agent.torch_threads=1")
@@ -33,7 +33,7 @@ def train(task, name, *words):
 
 
 def without_times(run, *, evaluation=True):
-    rows = read_metrics(run / "metrics.jsonl")
+    rows = [*read_rows(run / "metrics.jsonl")]
     excluded = "Perf/" if evaluation else ("Perf/", "Eval/")
     return [{name: value for name, value in row.items() if not name.startswith(excluded)} for row in rows]
 

@@ -7,7 +7,7 @@ import pytest
 from support.scheduled_task import MODEL, YAML
 
 from rlcli.cli.app import main
-from rlcli.training.loggers import read_metrics
+from rlcli.runs.metric_rows import read_rows
 
 DIRECT = """
 import itertools, random
@@ -105,7 +105,7 @@ def train(*words):
 
 
 def rows(run):
-    kept = [{k: v for k, v in row.items() if not k.startswith("Perf/")} for row in read_metrics(run / "metrics.jsonl")]
+    kept = [{k: v for k, v in row.items() if not k.startswith("Perf/")} for row in read_rows(run / "metrics.jsonl")]
     return kept, sorted(run.glob("checkpoints/*/policy.safetensors"))[-1].read_bytes()
 
 

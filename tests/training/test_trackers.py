@@ -15,8 +15,9 @@ import torch
 
 from rlcli.cli.app import main
 from rlcli.errors import DependencyError, pip_install
+from rlcli.runs.metric_rows import read_rows
 from rlcli.training import loggers
-from rlcli.training.loggers import LOGGERS, LoggerKind, check_loggers, read_metrics
+from rlcli.training.loggers import LOGGERS, LoggerKind, check_loggers
 from rlcli.training.trackers import BackgroundTracker
 
 SMALL = ("cartpole", "--agent", "ppo", "--num-envs", "8", "-q", "sim.engine_threads=1", "agent.torch_threads=1")
@@ -99,7 +100,7 @@ def without_times(row):
 def test_tracker_gets_metrics_and_configuration(capfd):
     run = train("a", "--max-iterations", "3", "--logger", "notebook")
     opened, *rows, closed = notes(run)
-    assert rows == read_metrics(run / "metrics.jsonl")
+    assert rows == [*read_rows(run / "metrics.jsonl")]
     assert {"agents", "rewards", "scene"} <= set(opened["opened"])
     assert closed == {"closed": "finished"}
     assert "best library" not in "".join(capfd.readouterr())
@@ -110,7 +111,7 @@ def test_tracker_does_not_change_training(logger, capfd):
     plain = train("plain", "--max-iterations", "3", "--logger", "none")
     tracked = train("tracked", "--max-iterations", "3", "--logger", logger)
     assert weights(plain) == weights(tracked)
-    rows = [[without_times(row) for row in read_metrics(run / "metrics.jsonl")] for run in (plain, tracked)]
+    rows = [[without_times(row) for row in read_rows(run / "metrics.jsonl")] for run in (plain, tracked)]
     assert rows[0] == rows[1]
     assert len(rows[0]) == 3
 
@@ -122,7 +123,7 @@ def test_failed_tracker_is_reported_once_and_dropped(iterations, capfd):
     assert err.count("the server said no") == 1
     assert "warning: the logger fails" in err
     assert json.loads((run / "run.json").read_text())["state"] == "finished"
-    assert len(read_metrics(run / "metrics.jsonl")) == iterations
+    assert len([*read_rows(run / "metrics.jsonl")]) == iterations
 
 
 def test_tracker_that_fails_at_the_end_is_reported(capfd):
@@ -135,13 +136,13 @@ def test_tracker_that_cannot_be_opened_is_a_machine_error(capfd):
     err = capfd.readouterr().err
     assert "the logger neveropens cannot be opened: the server said no" in err
     assert "--logger none" in err
-    assert read_metrics(run / "metrics.jsonl") == []
+    assert [*read_rows(run / "metrics.jsonl")] == []
 
 
 def test_resumed_run_continues_its_tracker_without_duplicate_steps(capfd):
     words = ("--logger", "notebook", "agent.save_interval=1")
     run = train("a", "--max-iterations", "4", *words)
-    rows = read_metrics(run / "metrics.jsonl")
+    rows = [*read_rows(run / "metrics.jsonl")]
     steps = [row["step"] for row in rows]
     for begin, end in (
         (steps[0], 2),
@@ -151,7 +152,7 @@ def test_resumed_run_continues_its_tracker_without_duplicate_steps(capfd):
         assert main(["train", "--resume", f"{run}@step:{begin}", "--max-iterations", str(end), "-q"]) == 0
     written = [row for row in notes(run) if "step" in row]
     assert [row["iteration"] for row in written] == [1, 2, 3, 4, 5, 6]
-    assert [row["step"] for row in written] == [row["step"] for row in read_metrics(run / "metrics.jsonl")]
+    assert [row["step"] for row in written] == [row["step"] for row in read_rows(run / "metrics.jsonl")]
     assert [path.name for path in run.glob("*.notes")] == ["note-0.notes"]
 
 
@@ -250,7 +251,7 @@ def train_without_network(tmp_path, *words):
 
 def test_training_needs_no_network(tmp_path):
     run, _ = train_without_network(tmp_path, *SMALL, "--max-iterations", "2")
-    assert len(read_metrics(run / "metrics.jsonl")) == 2
+    assert len([*read_rows(run / "metrics.jsonl")]) == 2
 
 
 @pytest.mark.slow
@@ -261,9 +262,9 @@ def test_library_works_offline_and_continues_after_resume(name, tmp_path):
     words = ("--max-iterations", "4", "agent.save_interval=1", "--logger", name)
     run, err = train_without_network(tmp_path, *SMALL, *words)
     assert ("wandb sync" in err) == (name == "wandb")
-    step = read_metrics(run / "metrics.jsonl")[1]["step"]
+    step = [*read_rows(run / "metrics.jsonl")][1]["step"]
     train_without_network(tmp_path, "--resume", f"{run}@step:{step}", "--max-iterations", "6", "-q")
-    rows = read_metrics(run / "metrics.jsonl")
+    rows = [*read_rows(run / "metrics.jsonl")]
     assert len(rows) == 6
     read = {"wandb": _read_wandb, "mlflow": _read_mlflow, "trackio": _read_trackio}[name]
     assert read(run, "Loss/value") == [(row["step"], pytest.approx(row["Loss/value"])) for row in rows]

@@ -9,8 +9,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from rlcli.runs.metric_rows import read_rows
 from rlcli.training.job import Job
-from rlcli.training.loggers import read_metrics
 from rlcli.training.runner import _training_videos
 from rlcli.training.signals import StopRequest
 from rlcli.viewer.training_video_recorder import TrainingVideos
@@ -44,7 +44,7 @@ def clips(run):
 
 
 def without_times(run):
-    rows = read_metrics(run / "metrics.jsonl")
+    rows = [*read_rows(run / "metrics.jsonl")]
     return [{name: value for name, value in row.items() if not name.startswith("Perf/")} for row in rows]
 
 

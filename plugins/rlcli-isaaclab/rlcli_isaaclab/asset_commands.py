@@ -11,9 +11,9 @@ from torch import Tensor
 from rlcli.envs.managed import ManagedEnv
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import TaskError, did_you_mean, listing
-from rlcli.scene.actuators import JointCommand
 from rlcli.scene.entity import Entity
 from rlcli.scene.jacobian import Jacobian
+from rlcli.scene.joint_command import JointCommand
 from rlcli.scene.model_fields import DERIVED_FROM
 from rlcli.sim.env_selection import Selection
 from rlcli.sim.rotations import rotate

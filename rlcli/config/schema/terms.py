@@ -7,7 +7,15 @@ import math
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import ConfigDict, Field, GetCoreSchemaHandler, GetJsonSchemaHandler, model_validator
+from pydantic import (
+    ConfigDict,
+    Field,
+    GetCoreSchemaHandler,
+    GetJsonSchemaHandler,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 from pydantic_core import CoreSchema, core_schema
 
 from rlcli.config.schema.base import (
@@ -311,6 +319,15 @@ class SuccessConfig(TermConfig):
 
     hold_s: Annotated[NotNegative, _Limits(0.0, 1e9)] = 1.0
     """How long the condition must hold before the time-out [s]; 0: in the last step."""
+
+    @field_validator("at_least")  # at_most is validated before, because it is declared before
+    @classmethod
+    def _at_most_is_above(cls, low: float | None, info: ValidationInfo) -> float | None:
+        high = info.data.get("at_most")
+        if low is not None and high is not None and low > high:
+            message = f"at_least is {low:g} and above at_most, which is {high:g}: no value meets both bounds"
+            raise ValueError(f"{message}; correct one of the two bounds")
+        return low
 
 
 def bound_text(condition: Mapping[str, Any]) -> str:

@@ -420,7 +420,3 @@ def _common_names(parts: Sequence[dict[str, Tensor]]) -> list[str]:
 
 def _state_shapes(env: VecEnv) -> dict[str, torch.Size]:
     return {name: value.shape for name, value in env.state_dict().items()}
-
-
-def _causes(env: VecEnv) -> dict[str, int]:
-    return env.causes

@@ -162,7 +162,7 @@ class RandomizeEffortLimit(RangeKeys, ActuatorTerm):
 
 
 @dataclass(kw_only=True, eq=False)
-class RandomizeActuatorStrength(ActuatorTerm, DrawingTerm):
+class RandomizeActuatorStrength(DrawingTerm, ActuatorTerm):
     """Random strength of actuators: a factor on their effort and its limits; 0.9 is a motor that is 10 % too weak.
 
     The term supports MuJoCo's own actuators whose force is linear, and actuator models. `applied_effort` of an actuator

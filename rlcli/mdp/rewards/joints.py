@@ -8,10 +8,11 @@ import torch
 from torch import Tensor
 
 from rlcli.mdp.parameter_types import Command, Entity, ManagedEnv
-from rlcli.mdp.term import JointTerm
+from rlcli.mdp.term import JointTerm, Term
 from rlcli.mdp.term_helpers import commanded_speed, is_moving, sum_columns
 from rlcli.sim.env_selection import Selection
 from rlcli.sim.rotations import length
+from rlcli.sim.saved_tensors import TensorState
 from rlcli.task import Joints
 
 
@@ -120,38 +121,31 @@ def action_l2(env: ManagedEnv) -> Tensor:
     return env.action_manager.action.square().sum(dim=1)
 
 
-class ActionAccL2:
+@dataclass(eq=False)
+class ActionAccL2(Term, TensorState):
     """Sum of the squared second differences a - 2 a' + a'' of the policy's action. (num_envs,)
 
     a: action of this step, a': of the step before, a'': of the step before that; zero before the episode.
     mjlab: `action_acc_l2`.
     """
 
-    def __init__(self, env: ManagedEnv) -> None:
-        self._env = env
-        self._before: Tensor | None = None
+    def __post_init__(self) -> None:
+        self._before = torch.zeros_like(self.env.action_manager.action)
 
     def __call__(self) -> Tensor:
         """Return the value of the reward term. (num_envs,)"""
-        action, previous = self._env.action_manager.action, self._env.action_manager.prev_action
-        if self._before is None:
-            self._before = torch.zeros_like(action)
+        action, previous = self.env.action_manager.action, self.env.action_manager.prev_action
         change = action - 2.0 * previous + self._before
         self._before.copy_(previous)
         return change.square_().sum(dim=1)
 
     def reset(self, selection: Selection) -> None:
         """Set the past actions to 0 in new episodes."""
-        if self._before is not None:
-            selection.write(self._before, 0.0)
+        selection.write(self._before, 0.0)
 
-    def state_dict(self) -> dict[str, Tensor]:
+    def tensors(self) -> dict[str, Tensor]:
         """Return the action that is a'' in the next step."""
-        return {"before": self._before.clone()} if self._before is not None else {}
-
-    def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Restore the state returned by `state_dict()`."""
-        self._before = state["before"].clone()
+        return {"before": self._before}
 
 
 def action_smoothness_penalty(env: ManagedEnv) -> Tensor:
