@@ -14,6 +14,6 @@ except OSError:  # the current folder was deleted; `main` reports this
 if not sys.flags.safe_path and sys.path and sys.path[0] in ("", current):
     del sys.path[0]
 
-from rlcli.cli.app import main
+from rlcli.cli import main
 
 sys.exit(main())

@@ -37,6 +37,7 @@ from rlcli.errors import (
 )
 from rlcli.machine.garbage_collection import delay_garbage_collection
 from rlcli.machine.memory import memory_error
+from rlcli.machine.stop_signals import end_on_signals, raise_on_signals, stopped_by_signal
 from rlcli.registry import OWN, TRAINERS, catalog, load_entry, load_object, malformed_metadata_ignored
 from rlcli.registry.changed_modules import ModuleCopies, change_of_module
 from rlcli.registry.task_code_monitor import (
@@ -129,6 +130,7 @@ def main(arguments: list[str] | None = None) -> int:
     if console.owns_process:
         # the library GLFW in MuJoCo starts a Python process, which otherwise imports from this folder
         os.environ.setdefault("PYTHONSAFEPATH", "1")
+        raise_on_signals()
         delay_garbage_collection()
         if hasattr(signal, "SIGALRM"):
             signal.signal(signal.SIGALRM, _on_alarm)
@@ -141,16 +143,28 @@ def main(arguments: list[str] | None = None) -> int:
     remember_given([*arguments, *(value for name, value in os.environ.items() if name.startswith("RLCLI_"))])
     console.json, console.debug = "--json" in arguments, "--debug" in arguments
     console.has_document = False  # an earlier command of this process may have printed one
-    with console.stdout_kept(), malformed_metadata_ignored(), exit_refused(), observe_task_code():
-        code = _run(_with_values(arguments))
+    try:
+        with console.stdout_kept(), malformed_metadata_ignored(), exit_refused(), observe_task_code():
+            code = _run(_with_values(arguments))
+        _flush_output()
+        if console.owns_process:
+            report_lasting_threads()
+    except KeyboardInterrupt:  # before or after the command
+        failure = stopped_by_signal()
+        if failure is None:
+            raise
+        console.error(failure)
+        code = failure.exit_code
+    end_on_signals()
+    return code
+
+
+def _flush_output() -> None:
     try:
         if sys.stdout is not None:
             sys.stdout.flush()
     except OSError:
         redirect_to_null(sys.stdout)
-    if console.owns_process:
-        report_lasting_threads()
-    return code
 
 
 def _on_alarm(_: int, frame: FrameType | None) -> None:
@@ -226,7 +240,8 @@ def _run(arguments: list[str]) -> int:
         failure: RlcliError = UsageError("no command given", hint="rlcli --help lists the commands")
     except BaseException as raised:  # the code of a task may raise any exception
         cause = raised.error if isinstance(raised, BodyError) else raised
-        failure = _as_rlcli_error(cause, arguments)
+        # a library that is being imported may replace KeyboardInterrupt by an error of its own
+        failure = stopped_by_signal() or _as_rlcli_error(cause, arguments)
         if failure.kind == "bug" or (isinstance(cause, ImportError) and copies.lost_modules):
             is_exit = isinstance(cause, SystemExit)
             by_module = None if is_exit else change_of_module(cause) or copies.error_of_lost_modules(cause)
@@ -234,7 +249,7 @@ def _run(arguments: list[str]) -> int:
         if failure.kind == "bug" and isinstance(cause, SystemExit):
             # the exception is not from a task or plugin: typer itself ends completions and closed pipes in this way
             raise
-        is_expected = isinstance(cause, ClickException | KeyboardInterrupt | typer.Abort)
+        is_expected = isinstance(cause, ClickException | KeyboardInterrupt | typer.Abort) or failure.kind == "stopped"
         if failure.kind == "bug" or (console.debug and not is_expected):
             traceback.print_exc()
     console.error(failure)

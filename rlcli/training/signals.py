@@ -17,10 +17,7 @@ from typing import Any
 
 from rlcli.envs.observers import StepObserver
 from rlcli.errors import INTERRUPTED, STOPPED, Stopped
-
-_SIGNALS = ("SIGINT", "SIGTERM", "SIGUSR1", "SIGHUP")
-"""Names of the signals that stop a training: from Ctrl-C, from a scheduler such as Slurm (SIGTERM, SIGUSR1), from a
-terminal that closes. Windows has only some of these signals."""
+from rlcli.machine.stop_signals import STOP_SIGNALS
 
 
 class Interrupted(KeyboardInterrupt):
@@ -96,7 +93,7 @@ class StopRequest(StepObserver):
     def __enter__(self) -> StopRequest:
         # Python allows signal handlers only in the main thread
         if threading.current_thread() is threading.main_thread():
-            for number in (getattr(signal, name) for name in _SIGNALS if hasattr(signal, name)):
+            for number in STOP_SIGNALS:
                 if signal.getsignal(number) is not signal.SIG_IGN:
                     self._previous[number] = signal.signal(number, self._receive)
         return self

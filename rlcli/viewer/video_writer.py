@@ -6,13 +6,20 @@ Importing the module is fast, so that commands can refuse a wrong file name at o
 from __future__ import annotations
 
 import contextlib
+import errno
 import importlib.util
+import os
 import shutil
+import signal
+import subprocess
+import tempfile
+from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rlcli.errors import DependencyError, MachineError, UsageError, pip_install
-from rlcli.runs.atomic_io import disk_errors, require_regular
+from rlcli.runs.atomic_io import disk_errors, remove_leftovers, require_regular
+from rlcli.safe_text import shorten
 
 if TYPE_CHECKING:
     import numpy as np
@@ -26,15 +33,14 @@ def check_video(file: Path) -> None:
 
     Raises:
         UsageError: for a file that is neither .mp4 nor .gif.
-        DependencyError: if imageio, or imageio-ffmpeg for an .mp4, is not installed.
+        DependencyError: if imageio for a .gif, or imageio-ffmpeg for an .mp4, is not installed.
         MachineError: if there is no ffmpeg for an .mp4.
     """
     if file.suffix not in FORMATS:
         raise UsageError(f"'{file}' is not a video file", hint=f"give FILE{' or FILE'.join(FORMATS)}")
-    needed = ["imageio"] if file.suffix == ".gif" else ["imageio", "imageio_ffmpeg"]
-    if any(importlib.util.find_spec(name) is None for name in needed):
-        message = f"a video in {file.suffix} needs {' and '.join(needed)}"
-        raise DependencyError(message, hint=pip_install("rlcli[video]"))
+    needed = "imageio" if file.suffix == ".gif" else "imageio_ffmpeg"
+    if importlib.util.find_spec(needed) is None:
+        raise DependencyError(f"a video in {file.suffix} needs {needed}", hint=pip_install("rlcli[video]"))
     if file.suffix == ".mp4":
         _require_ffmpeg()
 
@@ -71,31 +77,25 @@ class VideoWriter(contextlib.AbstractContextManager["VideoWriter"]):
 
     Raises:
         UsageError: for a file with another suffix.
-        DependencyError: if imageio is not installed.
+        DependencyError: if imageio or imageio-ffmpeg is not installed.
         MachineError: if there is no ffmpeg for an .mp4, or the file cannot be written.
     """
 
     def __init__(self, file: Path, period: float) -> None:
         check_video(file)
         require_regular(file)
-        import imageio.v2 as imageio
-
         self.file = file
         self.frames = 0
         self._added = 0
         self._stride = gif_stride(period) if file.suffix == ".gif" else 1
         self.fps = 1.0 / (period * self._stride)
-        self._temporary = file.with_name(f".{file.stem}.tmp{file.suffix}")
-        # a GIF has the duration of a frame [ms]
-        settings: dict[str, Any] = {"duration": 10.0 * round(100.0 / self.fps), "loop": 0}
-        if file.suffix == ".mp4":
-            # H.264 needs an even width and height: macro blocks of 2 pixels keep the size closest
-            settings = {"fps": self.fps, "codec": "libx264", "quality": 7, "macro_block_size": 2}
-            settings["ffmpeg_log_level"] = "error"
+        self._temporary = file.with_name(f".{file.name}.tmp-{os.getpid()}{file.suffix}")
         with disk_errors(file):
             file.parent.mkdir(exist_ok=True)
+            remove_leftovers(file.parent, file.name)
             self._temporary.unlink(missing_ok=True)  # the writer would follow a symbolic link
-            self._writer: Any = imageio.get_writer(self._temporary, **settings)
+            self._temporary.open("xb").close()  # a file that cannot be written is an error here, not at the end
+            self._writer = _gif(self._temporary, self.fps) if file.suffix == ".gif" else _Mp4(self._temporary, self.fps)
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         try:
@@ -115,11 +115,91 @@ class VideoWriter(contextlib.AbstractContextManager["VideoWriter"]):
         self._added += 1
         if (self._added - 1) % self._stride:
             return
-        try:
+        with disk_errors(self.file):
             self._writer.append_data(image)
-        except OSError as error:
-            raise MachineError(f"cannot write {self.file}: {error}") from error
         self.frames += 1
+
+
+def _gif(file: Path, fps: float) -> Any:
+    """Return imageio's writer of a GIF that repeats."""
+    import imageio.v2 as imageio
+
+    return imageio.get_writer(file, duration=10.0 * round(100.0 / fps), loop=0)  # duration of a frame [ms]
+
+
+class _Mp4:
+    """Writer of an .mp4: a process of ffmpeg reads the images from a pipe.
+
+    imageio's own writer ignores the exit code of ffmpeg, and a video that is cut off by a full disk counts as written.
+
+    Args:
+        file: path of the video.
+        fps: images per second.
+    """
+
+    def __init__(self, file: Path, fps: float) -> None:
+        self._file = file
+        self._fps = Fraction(fps).limit_denominator()
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def append_data(self, image: NDArray[np.uint8]) -> None:
+        """Append an RGB image. (height, width, 3)
+
+        Raises:
+            OSError: if ffmpeg has ended; the error has its last message.
+        """
+        process = self._process or self._start(*image.shape[:2])
+        assert process.stdin is not None
+        try:
+            process.stdin.write(image.tobytes())
+        except BrokenPipeError:
+            self.close()
+            raise
+
+    def _start(self, height: int, width: int) -> subprocess.Popen[bytes]:
+        import imageio_ffmpeg
+
+        images = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(self._fps), "-i", "-"]
+        # the pixel format that most players need, with an even width and height
+        video = ["-vcodec", "libx264", "-crf", "15", "-pix_fmt", "yuv420p"]
+        if width % 2 or height % 2:
+            video += ["-vf", f"scale={width + width % 2}:{height + height % 2}"]
+        command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-v", "error", *images, *video, str(self._file.absolute())]
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed by `close`; a full pipe would block ffmpeg
+        # in a process group of its own: Ctrl-C does not end ffmpeg
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=self._errors, process_group=0
+        )
+        return self._process
+
+    def close(self) -> None:
+        """Wait until ffmpeg has written the file.
+
+        Raises:
+            OSError: if ffmpeg has failed.
+        """
+        process, self._process = self._process, None
+        if process is None:
+            return
+        with self._errors:
+            with contextlib.suppress(BrokenPipeError):
+                process.communicate()
+            code = process.wait()
+            self._errors.seek(0)
+            messages = self._errors.read().decode(errors="replace")
+        if code:
+            raise _ffmpeg_error(code, messages)
+
+
+def _ffmpeg_error(code: int, messages: str) -> OSError:
+    """Return the system's error for which ffmpeg has failed, or one with the last line that ffmpeg printed."""
+    if code == -getattr(signal, "SIGXFSZ", 0):
+        return OSError(errno.EFBIG, os.strerror(errno.EFBIG))
+    for number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS, errno.EACCES):
+        if os.strerror(number) in messages:
+            return OSError(number, os.strerror(number))
+    last = " ".join((messages.splitlines() or [""])[-1].split())
+    return OSError(f"ffmpeg failed with exit code {code}: {shorten(last, 200)}" if last else f"ffmpeg failed: {code}")
 
 
 def gif_stride(period: float) -> int:

@@ -3,6 +3,7 @@
 import json
 import os
 import pty
+import random
 import re
 import shutil
 import signal
@@ -11,7 +12,7 @@ from pathlib import Path
 
 import pytest
 from support.child_processes import PATIENCE, SMALL
-from support.fault_sizes import chosen
+from support.fault_sizes import amount, chosen
 from support.run_comparison import assert_same_run, newest
 
 import rlcli_tasks.cartpole
@@ -178,3 +179,37 @@ def test_closed_terminal_does_not_stop_a_run_that_ignores_sighup(child, tmp_path
     os.close(terminal)
     assert process.ask(wait=process.pid, seconds=PATIENCE)["status"] == 0
     assert_same_run(run_in(tmp_path), uninterrupted)
+
+
+ENDLESS = ("eval", "cartpole", "--policy", "zero", "--episodes", "1000000", "scene.num_envs=4")
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize(
+    ("number", "code", "message"),
+    [
+        (signal.SIGINT, 130, "error: interrupted\n"),
+        (signal.SIGTERM, 75, "error: stopped by the signal SIGTERM\nhint: run the command again\n"),
+        (signal.SIGHUP, 75, "error: stopped by the signal SIGHUP\nhint: run the command again\n"),
+    ],
+)
+def test_signal_ends_a_command_that_does_not_train(start, empty_folder, number, code, message):
+    process = start("doctor")
+    assert process.stderr.readline().startswith("checking all plugins")
+    process.send_signal(number)
+    assert process.wait(timeout=PATIENCE) == code
+    assert process.stderr.read().endswith(message)
+    assert process.stdout.read() == ""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("words", [ENDLESS, ("list-tasks",), ("doctor",)])
+def test_signals_at_random_times_print_no_traceback(start, empty_folder, words, number):
+    for _ in range(amount(2, 10, 40)):
+        process = start(*words)
+        for _ in range(random.choice([1, 2, 3])):
+            time.sleep(random.uniform(0, 1))
+            process.send_signal(number)
+        assert process.wait(timeout=PATIENCE) in (0, 75, 130, -number)
+        assert "Traceback" not in process.stderr.read()

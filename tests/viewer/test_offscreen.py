@@ -120,7 +120,7 @@ def test_missing_gl_lists_backends_and_packages():
 
 @pytest.mark.slow
 def test_mp4_has_all_frames_at_control_rate(tmp_path):
-    file = tmp_path / "deep" / "er" / "x.mp4"
+    file = tmp_path / "deep" / "x.mp4"
     with VideoWriter(file, 1 / 60) as writer:
         for picture in PICTURES:
             writer.add(picture)
@@ -129,6 +129,44 @@ def test_mp4_has_all_frames_at_control_rate(tmp_path):
     assert fps == 60
     assert means == pytest.approx([0, 80, 160, 240], abs=6)
     assert sorted(p.name for p in file.parent.iterdir()) == ["x.mp4"]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits of file size")
+@pytest.mark.parametrize(("name", "limit"), [("x.mp4", 0), ("x.mp4", 4096), ("x.mp4", 40_000), ("x.gif", 4096)])
+def test_video_that_the_disk_cuts_off_is_an_error(name, limit, tmp_path):
+    import resource
+
+    def write():
+        with VideoWriter(tmp_path / name, 1 / 50) as writer:
+            for picture in np.random.default_rng(1).integers(0, 256, (40, 48, 64, 3), np.uint8):
+                writer.add(picture)
+
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, before[1]))
+    try:
+        with pytest.raises(MachineError, match=f"cannot write .*{name}: File too large$") as caught:
+            write()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert "ulimit -f" in caught.value.hint
+    assert not list(tmp_path.iterdir())
+
+
+def test_two_processes_write_a_video_of_one_name(tmp_path):
+    code = (
+        "import sys, numpy as np; from pathlib import Path; from rlcli.viewer.video_writer import VideoWriter\n"
+        "with VideoWriter(Path(sys.argv[1]), 1 / 50) as writer:\n"
+        "    writer.add(np.zeros((48, 64, 3), np.uint8)); print('begun', flush=True); sys.stdin.read()\n"
+    )
+    command = [sys.executable, "-c", code, str(tmp_path / "x.gif")]
+    both = [subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) for _ in range(2)]
+    for process in both:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "begun\n"
+    for process in both:
+        process.communicate("")
+        assert process.returncode == 0
+    assert [file.name for file in tmp_path.iterdir()] == ["x.gif"]
 
 
 @pytest.mark.parametrize(("period", "frames", "duration"), [(0.02, 4, 20), (0.05, 4, 50), (1 / 60, 2, 50)])
