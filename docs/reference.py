@@ -217,7 +217,7 @@ def _model(heading: str, model: dict[str, Any], links: dict[str, str]) -> Iterat
 
 
 def _terms() -> Iterator[tuple[str, TermEntry]]:
-    """Yield every built-in term with its section; randomization terms are a section of their own here."""
+    """Yield every built-in term with its section; randomisation terms are a section of their own here."""
     for entry in term_entries():
         yield ("randomization" if ".randomization" in entry.signature.module else entry.section), entry
 

@@ -304,7 +304,7 @@ class TaskCheck:
         model = load_entry(replace(entry, value=spec.algorithms[algorithm]), type)
         if not issubclass(model, AgentConfig):
             raise TaskError(
-                f"plugin {entry.distribution} {entry.version}: {model.__name__} is no subclass of AgentConfig;"
+                f"plugin {entry.distribution} {entry.version}: {model.__name__} is not a subclass of AgentConfig;"
                 " report it to the plugin's authors"
             )
         return spec, model

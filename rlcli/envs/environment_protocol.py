@@ -88,7 +88,7 @@ class Environment(Protocol):
                 (num_envs,) bool
 
         Raises:
-            DivergedError: for an action, observation or reward that is not finite. A diverged simulation is no error:
+            DivergedError: for an action, observation or reward that is not finite. A diverged simulation is not an error:
                 it ends the episode of its environment.
         """
 

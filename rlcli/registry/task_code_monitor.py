@@ -237,7 +237,7 @@ def _innermost_place(frames: Iterable[FrameType]) -> str | None:
 def frames_of_thread(thread: int | None) -> list[FrameType]:
     """Return the frames of a thread, innermost first, up to the start of the command.
 
-    The garbage collector is off meanwhile: Python 3.11 collects inside of `f_back`. If a finalizer then lets the thread
+    The garbage collector is off meanwhile: Python 3.11 collects inside of `f_back`. If a finaliser then lets the thread
     continue, `f_back` reads freed memory, and the process may crash.
 
     Args:

@@ -304,7 +304,7 @@ class Trajectory:
 
         Raises:
             TaskError: if the task is not installed any more.
-            CheckpointError: if the user has never named the task's code on this machine, so that it is not trusted; or
+            CheckpointError: if the task's code is not trusted (see `recorded_task`); or
                 if header and configuration do not agree.
             ConfigError: if the installed task does not accept the recorded configuration.
         """
@@ -377,7 +377,7 @@ def read_trajectory(file: Path) -> Trajectory:
         message = f"there is no recording, crash dump or failure case {file}"
         raise CheckpointError(message, hint="check the path; rlcli eval TASK --record FILE makes a recording") from None
     except (SafetensorError, OSError, ValueError, RecursionError) as error:
-        message = f"{file} is no valid recording, crash dump or failure case: {' '.join(str(error).split())}"
+        message = f"{file} is not a valid recording, crash dump or failure case: {' '.join(str(error).split())}"
         raise CheckpointError(message, hint="check the path; rlcli eval TASK --record FILE makes a recording") from None
     return Trajectory(file, header, tensors)
 

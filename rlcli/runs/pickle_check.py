@@ -136,7 +136,7 @@ class _Simulation:
             outer.depth = max(outer.depth, item.depth + 1)
             outer.size += item.size
         if outer.kind != kind or outer.stored:
-            raise _RefusedError("changes a value that is no list or dictionary, or is a part of another one")
+            raise _RefusedError("changes a value that is not a list or dictionary, or is a part of another one")
         if outer.depth > _MAX_DEPTH:
             raise _RefusedError(f"has values nested deeper than {_MAX_DEPTH} levels")
         if outer.size > MAX_BYTES:

@@ -66,7 +66,10 @@ def check_json(kind: type[Model], value: object, file: Path, *keys: str, hint: s
         return kind.model_validate_json(json.dumps(value))  # strict models accept a list for a tuple only in JSON
     except ValidationError as error:
         if error.errors()[0]["type"] == "json_invalid":
-            path, message = _find_half_character(value), "the text has half of a surrogate pair, which is no character"
+            path, message = (
+                _find_half_character(value),
+                "the text has half of a surrogate pair, which is not a character",
+            )
         else:
             problem = next(messages.problems(error, kind, value, messages.dotted))
             path, message = problem.path, problem.message
@@ -270,7 +273,7 @@ def _refuse_constant(name: str) -> NoReturn:
 def _finite_float(text: str) -> float:
     value = float(text)
     if not math.isfinite(value):
-        raise _StrictError(f"the number {text[:20]} is too large; allowed are numbers up to 1.8e308")
+        raise _StrictError(f"the number {text[:20]} is too large; the largest number allowed is 1.8e308")
     return value
 
 

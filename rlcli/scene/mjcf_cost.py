@@ -178,7 +178,7 @@ def element_cost(name: str, attributes: dict[str, str]) -> float:
 
 
 def mjcf_number(text: str) -> float:
-    """Return the number in an attribute of an MJCF; NaN for text that is no number."""
+    """Return the number in an attribute of an MJCF; NaN for text that is not a number."""
     try:
         return float(text)
     except ValueError:

@@ -292,7 +292,9 @@ def _lstm(weights: Mapping[str, Tensor], prefix: str, file: Path) -> tuple[dict[
     for name, value in tensors_with_prefix(weights, prefix).items():
         kind, _, layer = name.rpartition("_l")
         if kind not in ("weight_ih", "weight_hh", "bias_ih", "bias_hh") or not (layer.isdecimal() and len(layer) < 3):
-            raise CheckpointError(f"{file}: {prefix}{name[:60]} is no weight of an LSTM; other RNNs cannot be imported")
+            raise CheckpointError(
+                f"{file}: {prefix}{name[:60]} is not a weight of an LSTM; other RNNs cannot be imported"
+            )
         lstm[f"memory.layers.{layer}.{kind}"] = value
     cells: list[int] = []
     while (recurrent := lstm.get(f"memory.layers.{len(cells)}.weight_hh")) is not None:

@@ -70,7 +70,7 @@ class TrainingProcess:
 
     @property
     def has_failed(self) -> bool:
-        """Whether the process has ended with an error; a requested stop is no error."""
+        """Whether the process has ended with an error; a requested stop is not an error."""
         return self.exit_code != 0 and not (self.stop_requested and self.exit_code == STOPPED)
 
     def error(self) -> RlcliError:

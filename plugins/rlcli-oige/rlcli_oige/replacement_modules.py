@@ -110,7 +110,7 @@ def _line_without_counterpart(file: Path) -> int:
 
 
 class _Module(ModuleType):
-    """Replacement of a module of Omniverse or USD."""
+    """Replacement for a module of Omniverse or USD."""
 
     def __getattr__(self, name: str) -> Any:
         vocabulary = importlib.import_module("rlcli_oige.vocabulary")

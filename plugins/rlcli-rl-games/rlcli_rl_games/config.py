@@ -17,7 +17,7 @@ Fraction = Annotated[float, Field(ge=0, le=1)]
 Activation = Literal["elu", "relu", "tanh", "swish"]
 """Activations of rl_games that a saved policy supports as well; swish is SiLU."""
 Initializer = dict[str, str | int | float]
-"""`{name: default}`, or another initializer of rl_games with its parameters."""
+"""`{name: default}`, or another initialiser of rl_games with its parameters."""
 Nothing = Literal["None"] | None
 _DEFAULT: Initializer = {"name": "default"}
 _ZERO: Initializer = {"name": "const_initializer", "val": 0}
@@ -67,7 +67,7 @@ class MlpConfig(StrictModel):
     activation: Activation
     """Activation after each hidden layer."""
     initializer: Initializer = _DEFAULT
-    """How the weights are initialized: `{name: default}`, or another initializer of rl_games with its parameters."""
+    """How the weights are initialised: `{name: default}`, or another initialiser of rl_games with its parameters."""
     regularizer: dict[str, Any] | None = None
     """Ignored, as in rl_games."""
     d2rl: Literal[False] = False
@@ -78,15 +78,15 @@ class ContinuousConfig(StrictModel):
     """Settings of the normal distribution from which actions are sampled."""
 
     mu_activation: Nothing = None
-    """Activation on the mean: only null."""
+    """Activation on the mean; must be null."""
     sigma_activation: Nothing = None
-    """Activation on the logarithm of the standard deviation: only null."""
+    """Activation on the logarithm of the standard deviation; must be null."""
     mu_init: Initializer = _DEFAULT
-    """Initializer of the layer that computes the mean."""
+    """Initialiser of the layer that computes the mean."""
     sigma_init: Initializer = _ZERO
-    """Initializer of the logarithm of the standard deviation, such as `{name: const_initializer, val: 0}`."""
+    """Initialiser of the logarithm of the standard deviation, such as `{name: const_initializer, val: 0}`."""
     fixed_sigma: Literal[True] = True
-    """Whether the standard deviation is trained but does not depend on the observation: only true."""
+    """Whether the standard deviation is trained but does not depend on the observation; must be true."""
 
 
 class SpaceConfig(StrictModel):
@@ -115,7 +115,7 @@ class SacNetworkConfig(StrictModel):
     name: Literal["soft_actor_critic"] = "soft_actor_critic"
     """Name of the network in rl_games."""
     separate: Literal[True] = True
-    """Whether actor and critics have separate networks: only true."""
+    """Whether actor and critics have separate networks; must be true."""
     space: dict[str, Any] | None = None
     """Ignored, as in rl_games."""
     mlp: MlpConfig
@@ -138,7 +138,7 @@ class RewardShaper(StrictModel):
 
 
 class CentralValueConfig(_Settings):
-    """Settings of a critic with its own network and optimizer, which observes the group `critic`."""
+    """Settings of a critic with its own network and optimiser, which observes the group `critic`."""
 
     network: CentralNetworkConfig
     """Network of the critic."""
@@ -153,7 +153,7 @@ class CentralValueConfig(_Settings):
     clip_value: bool
     """Whether the loss is the larger error of the value and of the value clipped to its old prediction +- e_clip."""
     normalize_input: bool
-    """Whether this critic's observations are normalized by running mean and standard deviation."""
+    """Whether this critic's observations are normalised by running mean and standard deviation."""
     truncate_grads: bool = False
     """Whether the norm of the gradient is clipped to grad_norm."""
     grad_norm: Positive = 1.0
@@ -172,7 +172,7 @@ class CentralNetworkConfig(StrictModel):
     name: Literal["actor_critic"] = "actor_critic"
     """Name of the network in rl_games."""
     central_value: Literal[True] = True
-    """Whether the network only has a value output, no actions: only true."""
+    """Whether the network has a value output and no actions; must be true."""
     mlp: MlpConfig
     """The hidden layers of the critic."""
 
@@ -181,11 +181,11 @@ class PpoSettings(_Settings):
     """Settings of PPO: the mapping `params.config`."""
 
     normalize_input: bool
-    """Whether observations are normalized by running mean and standard deviation."""
+    """Whether observations are normalised by running mean and standard deviation."""
     normalize_value: bool = False
-    """Whether the critic is trained on returns that are normalized by running mean and standard deviation."""
+    """Whether the critic is trained on returns that are normalised by running mean and standard deviation."""
     normalize_advantage: bool
-    """Whether advantages are normalized over the rollout."""
+    """Whether advantages are normalised over the rollout."""
     value_bootstrap: bool = True
     """Whether a time-out is bootstrapped; `bootstrap` sets how."""
     reward_shaper: RewardShaper = RewardShaper()
@@ -195,7 +195,7 @@ class PpoSettings(_Settings):
     gamma: Fraction
     """Discount factor."""
     tau: Fraction
-    """Lambda of generalized advantage estimation."""
+    """Lambda of generalised advantage estimation."""
     learning_rate: Positive
     """Learning rate of Adam."""
     lr_schedule: Literal["adaptive", "linear", "constant", "identity", "None"] | None = None
@@ -249,7 +249,7 @@ class SacSettings(_Settings):
     """Settings of SAC: the mapping `params.config`."""
 
     normalize_input: bool = False
-    """Whether observations are normalized by running mean and standard deviation."""
+    """Whether observations are normalised by running mean and standard deviation."""
     value_bootstrap: bool = True
     """Whether a time-out is bootstrapped; `bootstrap` sets how."""
     reward_shaper: RewardShaper = RewardShaper()
@@ -374,7 +374,7 @@ class RlGamesConfig(AgentConfig):
 
 
 class PpoConfig(RlGamesConfig):
-    """Proximal policy optimization (rl_games' `a2c_continuous`)."""
+    """Proximal policy optimisation (rl_games' `a2c_continuous`)."""
 
     algorithm: Literal["ppo"] = "ppo"
     """Algorithm: ppo."""

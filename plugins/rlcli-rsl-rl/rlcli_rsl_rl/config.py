@@ -167,7 +167,7 @@ class AlgorithmConfig(StrictModel):
     gamma: Fraction = 0.99
     """Discount factor."""
     lam: Fraction = 0.95
-    """Lambda of generalized advantage estimation."""
+    """Lambda of generalised advantage estimation."""
     entropy_coef: NotNegative = 0.01
     """Weight of the entropy bonus."""
     value_loss_coef: NotNegative = 1.0
