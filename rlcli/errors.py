@@ -192,7 +192,7 @@ def error_text(error: BaseException) -> str:
 
 
 def error_with_type(error: BaseException) -> str:
-    """Return the message of an error; if the error is no `RlcliError`, with the name of its class in front."""
+    """Return the message of an error; if the error is not a `RlcliError`, the name of its class is in front."""
     if isinstance(error, RlcliError):
         return error.message
     return ": ".join(filter(None, (type(error).__name__, error_text(error))))

@@ -319,7 +319,7 @@ def _read_json(file: Path) -> dict[str, Any]:
 
 
 def _parse_details(row: object) -> Details | None:
-    """Return the `Details` in a JSON value of an untrusted file; None if the value is not a mapping or a type is wrong."""
+    """Return the `Details` in a JSON value of an untrusted file; None if the value or a type is wrong."""
     if not isinstance(row, dict):
         return None
     known = {f.name: row[f.name] for f in fields(Details) if f.name in row}

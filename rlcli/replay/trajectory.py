@@ -255,8 +255,8 @@ class Header(_Strict):
         """Check that the numbers of steps, calls and episodes fit each other and the kind of the file."""
         for world in self.worlds:
             if len(world.follows) != len(world.nstep) - 1 or world.first >= len(world.nstep):
-                message = f"the lists `nstep` and `follows` of environment {world.env}, or its number `first`"
-                raise ValueError(f"{message}, do not fit together")
+                message = f"`nstep`, `follows` and `first` of environment {world.env} do not fit together"
+                raise ValueError(f"the file is damaged: {message}")
         if sum(count for world in self.worlds for count in world.nstep) > MAX_SUBSTEPS:
             raise ValueError(f"the file is damaged: it has more than {MAX_SUBSTEPS} physics steps")
         for number, e in enumerate(self.episodes):

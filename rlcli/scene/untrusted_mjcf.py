@@ -41,7 +41,7 @@ _WALL_TIME_S = 6 * TIME_S
 _MAX_ITERATIONS = 100_000
 _MAX_GRAVITY = 10_000
 _compiled: set[tuple[object, ...]] = set()
-"""Scenes that a subprocess has compiled without an error, as their files with versions; they need no second check."""
+"""Files and their versions of scenes that a subprocess has compiled without an error, and need no second check."""
 MUJOCO_ERRORS = (ValueError, RuntimeError, MemoryError, mujoco.FatalError, mujoco.UnexpectedError)
 """Exceptions that MuJoCo raises for a model that it cannot read or compile."""
 
