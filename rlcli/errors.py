@@ -146,7 +146,7 @@ class Stopped(RlcliError):
 
 
 def did_you_mean(name: str, candidates: Iterable[str]) -> str | None:
-    """Return `did you mean 'x'?` for the candidates (at most three) that are similar to a name; None without such."""
+    """Return `did you mean 'x'?` with the (at most three) candidates that are similar to a name; None if none is."""
     known = dict.fromkeys(itertools.islice(candidates, 1000))
     close = difflib.get_close_matches(name[:200], known, n=3, cutoff=0.6)
     return f"did you mean {' or '.join(repr(match) for match in close)}?" if close else None

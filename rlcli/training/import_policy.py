@@ -124,7 +124,7 @@ def read_rsl_rl(file: Path, *, activation: str | None = None, action_bound: floa
             stats = _named_tensors(saved["obs_norm_state_dict"], where)
         std = {"std": "std", "log_std": "log_std"}
     if not any(name.startswith(hidden) for name in weights):
-        raise CheckpointError(f"{file} must have an actor of RSL-RL; {_some_names(weights)}")
+        raise CheckpointError(f"{file} has no actor of RSL-RL; {_some_names(weights)}")
     layers = _layers(weights, hidden, file)
     spec, actor = _mlp_policy("gaussian-mlp", layers, activation or "elu", action_bound, file)
     actor["log_std"] = _log_std(weights, std, file)

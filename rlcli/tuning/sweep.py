@@ -142,7 +142,7 @@ class Sweep:
         return [trial for trial in self.trials() if trial.state.name == "COMPLETE"]
 
     def best(self) -> FrozenTrial | None:
-        """Return the finished trial with the best objective, of equal ones the first; None if no trial is finished."""
+        """Return the finished trial with the best objective (the first of equal ones); None if no trial is finished."""
         done = self._finished()
         if not done:
             return None
@@ -223,7 +223,7 @@ class Sweep:
         trial.release()
 
     def write_preset(self, data: Callable[[Mapping[str, Any]], Mapping[str, Any]]) -> Path | None:
-        """Write a `--config` file with the settings of the best trial; return the file, or None without finished trial.
+        """Write a `--config` file with the settings of the best trial; return the file, None if no trial is finished.
 
         Args:
             data: returns the content of the file for a trial's values (key -> value).

@@ -292,7 +292,7 @@ def test_repeated_tensor_does_not_fill_the_memory(monkeypatch):
 @pytest.mark.parametrize(
     ("weights", "output"),
     [
-        ({}, "must have an actor"),
+        ({}, "has no actor of RSL-RL"),
         ({"actor.0.weight": torch.zeros(1, 4)}, "use linear layers with a bias"),
         ({"actor.0.weight": torch.zeros(1, 4), "actor.0.bias": torch.zeros(3)}, "use linear layers with a bias"),
         ({"actor.0.weight": torch.zeros(1, 4), "actor.0.bias": torch.zeros(1)}, "depends on the state"),

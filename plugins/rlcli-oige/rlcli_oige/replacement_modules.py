@@ -82,7 +82,7 @@ def find_numpy(name: str, file: str = "") -> ModuleType | None:
 def find_hydra(name: str, file: str = "") -> ModuleType | None:
     """Return the replacement of `hydra` for a file of OmniIsaacGymEnvs: the use of its names raises an error.
 
-    The same for `omegaconf` if it is not installed; None in all other cases.
+    Return a replacement of `omegaconf` too, if it is not installed. Return None in all other cases.
     """
     own = file and "omniisaacgymenvs" in Path(file).read_text(encoding="utf-8", errors="replace")
     return find(name) if own and (name != "omegaconf" or importlib.util.find_spec(name) is None) else None
