@@ -183,7 +183,7 @@ _MAX_ERROR_TEXT = 20_000
 def error_text(error: BaseException) -> str:
     """Return the message of an error, cut to `_MAX_ERROR_TEXT` characters.
 
-    If the error's `__str__` itself raises an exception, return a text that says so.
+    If the error's `__str__` itself raises an exception, return a text that states this.
     """
     try:
         return str(error)[:_MAX_ERROR_TEXT]
@@ -217,7 +217,7 @@ def require_known(name: str, names: Sequence[str], what: str, plural: str) -> No
     Args:
         name: the name that the user typed.
         names: the valid names.
-        what: noun for the message that says what the name stands for, such as `policy`.
+        what: noun for the message, which describes the name, such as `policy`.
         plural: the plural of `what`, for the hint.
 
     Raises:

@@ -305,7 +305,7 @@ class TaskCheck:
         if not issubclass(model, AgentConfig):
             raise TaskError(
                 f"plugin {entry.distribution} {entry.version}: {model.__name__} is not a subclass of AgentConfig;"
-                " report it to the plugin's authors"
+                " report this bug to the plugin's authors"
             )
         return spec, model
 
@@ -316,7 +316,7 @@ class TaskCheck:
         data = {key: value for key, value in self.layers.data.items() if key not in PATCHES}
         self.format = formats.format_of_key(foreign_keys(data)) or self.format
         if "foreign" in data:
-            message = "a task file has no key 'foreign': settings of another framework stand at the top level"
+            message = "a task file has no key 'foreign': settings of another framework belong at the top level"
             self.problem(("foreign",), message, "write the framework's own key, such as 'oige', without 'foreign'")
         for section in [name for name in SECTIONS if isinstance(_mapping(data.get(name)).get("func"), str)]:
             func = data.pop(section)["func"]

@@ -93,7 +93,7 @@ def _known_details(entry: Entry, cache: dict[str, Any]) -> Details | None:
         return shipped
     probed = _parse_details(cache.get(_key(entry)))
     if probed is not None and probed.broken:
-        return probed  # the task is broken on this machine, whatever the plugin's own index says
+        return probed  # the task is broken on this machine, whatever the plugin's own index contains
     return shipped or probed
 
 

@@ -397,7 +397,7 @@ def _check_tensors(header: Header, tensors: Mapping[str, Tensor]) -> None:
     """Check the shapes and types of the tensors that a replay reads.
 
     Raises:
-        ValueError: if a tensor is missing, or has another shape or type than the header says.
+        ValueError: if a tensor is missing, or has another shape or type than in the header.
     """
     shapes: dict[str, tuple[int | None, ...]] = {}
     if header.kind == "recording":

@@ -98,7 +98,7 @@ def storage_errors(storage: str | None) -> Iterator[None]:
 
 
 def without_password(url: str) -> str:
-    """Return a URL without its password, which stands before the `@` or in the query (`?password=`)."""
+    """Return a URL without its password, which is before the `@` or in the query (`?password=`)."""
     url = re.sub(r"([?&][^=&]*(?:password|passwd|pwd|secret|token)[^=&]*)=[^&]*", r"\1=", url, flags=re.IGNORECASE)
     before, at, after = url.rpartition("@")
     if not at:

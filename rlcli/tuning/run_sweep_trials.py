@@ -227,7 +227,7 @@ class TrialRunner:
     def _end(self, stage: _Stage, stopping: bool) -> None:
         """Handle the end of a process: after a training, start the evaluation; else store the trial's result or error.
 
-        `stopping` says whether a signal has stopped the process; the trial can then be resumed.
+        `stopping` is whether a signal has stopped the process; the trial can then be resumed.
 
         Raises:
             RlcliError: for an error that does not depend on the trial, such as a full disk.

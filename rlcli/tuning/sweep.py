@@ -300,7 +300,7 @@ def open_sweep(
     Args:
         folder: the folder of the sweep; created if it does not exist.
         settings: entries of `_SweepSettings`; except for `trials`, they must equal those of the existing sweep.
-        source: entries of `RecordedTask`, which say where the task is; they must equal those of the existing sweep.
+        source: entries of `RecordedTask`, with the place of the task; they must equal those of the existing sweep.
         parameters: the keys of the task or agent that the sweep varies, with their ranges.
         storage: URL of a database for the trials; None: the file `JOURNAL` in the folder.
 
