@@ -39,7 +39,7 @@ class StudyView(AbstractContextManager[Any], Protocol):
     """
 
     def poll(self) -> None:
-        """Update the display, unless the last update was just before."""
+        """Update the display, unless it was updated a moment ago."""
 
 
 @dataclass(slots=True)

@@ -29,7 +29,7 @@ class RunCheckpoints:
     seed: int = 0
 
     def steps(self) -> list[int]:
-        """Return the existing checkpoints, each by its number of environment steps, ascending; empty without folder."""
+        """Return the existing checkpoints, each by its number of environment steps, ascending; empty if there is no folder."""
         try:
             return steps(self.run.checkpoints)
         except OSError:

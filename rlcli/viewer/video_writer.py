@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rlcli.errors import DependencyError, MachineError, UsageError, pip_install
-from rlcli.runs.atomic_io import disk_errors, require_regular
+from rlcli.runs.atomic_io import disk_error, disk_errors, require_regular
 
 if TYPE_CHECKING:
     import numpy as np
@@ -118,7 +118,7 @@ class VideoWriter(contextlib.AbstractContextManager["VideoWriter"]):
         try:
             self._writer.append_data(image)
         except OSError as error:
-            raise MachineError(f"cannot write {self.file}: {error}") from error
+            raise disk_error(self.file, error) from error
         self.frames += 1
 
 
