@@ -21,8 +21,8 @@ KEYWORDS = ("latest", "shipped")
 def path_of(word: str) -> Path:
     """Return the path that a word of the command line names.
 
-    For a keyword, such as `latest` in `latest` or `latest@best`, the returned path does not exist: a keyword never names
-    a file. Write `./latest` for a folder called `latest`.
+    A keyword (`latest`, also in `latest@best`) never names a file: the returned path does not exist. Write `./latest`
+    for a folder called `latest`.
     """
     return Path(os.devnull, word) if word.partition("@")[0] in KEYWORDS else Path(word)
 

@@ -148,8 +148,8 @@ def _libraries() -> list[Path]:
 def observe_task_code() -> Iterator[None]:
     """Report what the code of tasks and plugins does in the `with` block, each as one warning in rlcli's log.
 
-    Reported are warnings of this code, records of its loggers without a handler, errors in its threads and destructors,
-    and calls that have not returned after `SLOW_S`. Each line of code is reported once.
+    The reports are warnings of this code, records of its loggers without a handler, errors in its threads and
+    destructors, and calls that have not returned after `SLOW_S`. Each line of code is reported once.
     """
     # an earlier command of this process may have filled these caches
     for function in (warn_once, is_task_file, _plugins):

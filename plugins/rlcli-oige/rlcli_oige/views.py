@@ -29,7 +29,7 @@ class XFormPrimView(Counterpart):
     """View of the frames or bodies that a path expression matches in each environment. Rows are ordered by environment.
 
     Args:
-        prim_paths_expr: a path whose steps may be regular expressions: `/World/envs/.*/Ant/torso`.
+        prim_paths_expr: a path whose parts may be regular expressions: `/World/envs/.*/Ant/torso`.
         name: name of the view.
     """
 

@@ -260,7 +260,7 @@ class RunnerConfig(AgentConfig):
             clip = data.pop("clip_actions")
             if data.get("action_bound", clip) != clip:
                 bound = data["action_bound"]
-                raise ValueError(f"clip_actions ({clip}) and action_bound ({bound}) name one setting: remove one")
+                raise ValueError(f"clip_actions ({clip}) and action_bound ({bound}) set the same value: remove one")
             data["action_bound"] = clip
         return _tuples(data)
 
