@@ -204,7 +204,7 @@ def short_error(error: BaseException) -> str:
 
 
 def one_line(error: BaseException, limit: int | None = None) -> str:
-    """Return the message of an error on one line, cut to `limit` characters; without message, the name of its class."""
+    """Return the message of an error on one line, cut to `limit` characters; the name of its class if it has none."""
     text = " ".join(error_text(error).split())
     if "set_int_max_str_digits" in text:  # Python's advice does not help users of rlcli
         text = "a number has more than 4300 digits"

@@ -295,11 +295,14 @@ def _patch_problems(patch: schema.PatchConfig, edge: float, resolution: float) -
     if isinstance(patch, schema.StairsPatchConfig) and not patch.boxes and patch.step_width < 2 * resolution:
         yield (
             "step_width",
-            f"a step of {patch.step_width:g} m needs a resolution of half that, not {resolution:g} m",
+            f"a step of {patch.step_width:g} m needs a resolution of at most {patch.step_width / 2:g} m, found {resolution:g} m",
             fine,
         )
     if isinstance(patch, schema.GridPatchConfig) and not patch.boxes and patch.cell < 2 * resolution:
-        yield "cell", f"a cell of {patch.cell:g} m needs a resolution of half that, not {resolution:g} m", fine
+        message = (
+            f"a cell of {patch.cell:g} m needs a resolution of at most {patch.cell / 2:g} m, found {resolution:g} m"
+        )
+        yield "cell", message, fine
     if isinstance(patch, schema.ObstaclesPatchConfig | schema.StonesPatchConfig):
         if patch.width[1] > edge:
             message = f"a width of {patch.width[1]:g} m does not fit in a patch of {edge:g} m"
