@@ -111,7 +111,7 @@ class ModelsTogether:
         if self.cost.total > MAX_COST:
             raise BadModel(
                 f"{model.file}: the first {len(self._models)} models of the scene are too large together: the estimated"
-                f" cost of their compilation is {self.cost.total:,.0f}, at most {MAX_COST:,} is allowed (an ordinary"
+                f" cost of their compilation is {self.cost.total:,.0f}; at most {MAX_COST:,} is allowed (an ordinary"
                 " element costs 1, a mesh or image more); use fewer entities or smaller meshes"
             )
 
