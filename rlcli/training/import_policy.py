@@ -60,7 +60,7 @@ def read_sb3(
         file: file that `model.save` has written; only its member `policy.pth` is read.
         activation: activation of the hidden layers, which the file does not contain; None: the library's default.
         action_bound: bound of the actions in the training, which were within +-action_bound.
-        normalizer: safetensors file with `mean` and `var` of VecNormalize; None: observations were not normalised.
+        normalizer: safetensors file with `mean` and `var` of `VecNormalize`; None: observations were not normalised.
 
     Raises:
         CheckpointError: if the file has another format, contains anything but tensors, or another kind of policy.
@@ -325,7 +325,7 @@ def _normalizer(mean: Tensor, var: Tensor, stats: Mapping[str, Tensor]) -> dict[
 
 
 def _vec_normalize(file: Path) -> dict[str, Tensor]:
-    """Read the normaliser of SB3's VecNormalize from a safetensors file."""
+    """Read the normaliser of SB3's `VecNormalize` from a safetensors file."""
     data = read_archive_file(file)
     if data[:1] == b"\x80" or file.suffix == ".pkl":
         message = f"{file} is a pickle, which rlcli does not open; --normalizer takes a .safetensors file"

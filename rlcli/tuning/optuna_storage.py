@@ -46,7 +46,8 @@ def open_study(folder: Path, settings: Mapping[str, Any], storage: str | None, *
 
     Args:
         folder: the folder of the sweep, which contains the journal file.
-        settings: settings of the sweep: `task`, `name`, `direction` (maximize or minimize), `pruner` (median or none).
+        settings: settings of the sweep: `task`, `name`, `direction` (`maximize` or `minimize`), `pruner` (`median` or
+            `none`).
         storage: URL of a database; None: the journal file in the folder.
         create: whether to create the study if it does not exist.
 
