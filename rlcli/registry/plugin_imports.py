@@ -125,7 +125,7 @@ def _plugin_named(entry: Entry, failure: str, passed_on: type[RlcliError]) -> It
 
 
 def import_object(reference: str) -> Any:
-    """Import and return the object of a reference `package.module:Name`. What the import prints goes to stderr."""
+    """Import and return the object of a reference `package.module:Name`. The output of the import goes to stderr."""
     name, _, attributes = reference.rpartition(":")
     if not name:
         raise ValueError("the reference names no object of a module; write MODULE:OBJECT")

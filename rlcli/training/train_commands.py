@@ -131,7 +131,7 @@ def train_all(
         device: device of the trainings.
         jobs: largest number of processes at a time.
         options: further options of each `rlcli train` command.
-        stop: stores whether a signal has asked this process to stop.
+        stop: stores whether a signal has requested a stop.
         poll: called every `POLL_S` seconds while processes run.
 
     Returns:

@@ -126,7 +126,7 @@ class TrialRunner:
         request: the request for the trainings.
         objective: the metric that ranks the trials, and the limit of their training.
         jobs: number of trials at a time.
-        stop: stores whether a signal has asked to stop.
+        stop: stores whether a signal has requested a stop.
     """
 
     def __init__(

@@ -71,7 +71,7 @@ class MlpConfig(StrictModel):
     regularizer: dict[str, Any] | None = None
     """Ignored, as in rl_games."""
     d2rl: Literal[False] = False
-    """Whether every hidden layer also receives the input (a D2RL network): not supported."""
+    """Whether every hidden layer also receives the input (a D2RL network); must be false."""
 
 
 class ContinuousConfig(StrictModel):
@@ -151,7 +151,7 @@ class CentralValueConfig(_Settings):
     minibatch_size: Count
     """Samples per minibatch."""
     clip_value: bool
-    """Whether the loss is the larger error of the value and of the value clipped to its old prediction +- e_clip."""
+    """Whether the loss is the larger of two errors: of the value, and of the value clipped to the old one +- e_clip."""
     normalize_input: bool
     """Whether this critic's observations are normalised by running mean and standard deviation."""
     truncate_grads: bool = False
@@ -159,7 +159,7 @@ class CentralValueConfig(_Settings):
     grad_norm: Positive = 1.0
     """Maximum norm of the gradient, with truncate_grads."""
     e_clip: Positive = 0.2
-    """Largest change of the value from its old prediction, with clip_value."""
+    """Largest change of the value from the old value, with clip_value."""
     kl_threshold: Positive | None = None
     """Ignored, as in rl_games."""
     weight_decay: NotNegative = 0.0
@@ -191,7 +191,7 @@ class PpoSettings(_Settings):
     reward_shaper: RewardShaper = RewardShaper()
     """Scale, shift and limits of the reward."""
     mixed_precision: Literal[False] = False
-    """Whether updates use mixed precision; only False is allowed."""
+    """Whether updates use mixed precision; must be false."""
     gamma: Fraction
     """Discount factor."""
     tau: Fraction
@@ -211,9 +211,9 @@ class PpoSettings(_Settings):
     entropy_coef: NotNegative
     """Weight of the entropy bonus."""
     e_clip: Positive
-    """Largest deviation of the probability ratio from 1, and with clip_value of the value from its old prediction."""
+    """Largest deviation of the probability ratio from 1; with clip_value, also of the value from the old value."""
     clip_value: bool
-    """Whether the value loss is the larger error of the value and of the value clipped to the old one +- e_clip."""
+    """Whether the loss is the larger of two errors: of the value, and of the value clipped to the old one +- e_clip."""
     clip_actions: bool = True
     """Whether actions are clipped to +-1."""
     horizon_length: Count
@@ -255,7 +255,7 @@ class SacSettings(_Settings):
     reward_shaper: RewardShaper = RewardShaper()
     """Scale, shift and limits of the reward."""
     mixed_precision: Literal[False] = False
-    """Whether updates use mixed precision; only False is allowed."""
+    """Whether updates use mixed precision; must be false."""
     gamma: Fraction = 0.99
     """Discount factor."""
     num_steps_per_episode: Count = 1

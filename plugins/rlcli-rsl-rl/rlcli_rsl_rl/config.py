@@ -32,7 +32,7 @@ class PolicyConfig(StrictModel):
     noise_std_type: Literal["scalar", "log"] = "scalar"
     """Trained parameter: the standard deviation (scalar), or its logarithm (log)."""
     state_dependent_std: Literal[False] = False
-    """Whether the standard deviation depends on the state; only false is supported."""
+    """Whether the standard deviation depends on the state; must be false."""
     actor_obs_normalization: bool | None = None
     """Normalise the actor's observations by running mean and standard deviation; null: use empirical_normalization."""
     critic_obs_normalization: bool | None = None
