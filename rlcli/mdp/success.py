@@ -23,7 +23,7 @@ def joint_error(env: VecEnv, *, entity: Entity = "robot", joints: Joints = ".*",
 def root_velocity(
     env: VecEnv, *, entity: Entity = "robot", direction: tuple[float, float, float] = (1.0, 0.0, 0.0)
 ) -> Tensor:
-    """Root's velocity along `direction` [m/s]. (num_envs,)
+    """Velocity of the root along `direction` [m/s]. (num_envs,)
 
     direction: unit vector, world frame.
     """
