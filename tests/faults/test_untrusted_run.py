@@ -312,7 +312,9 @@ def test_task_plays_where_it_was_trained_or_has_been_named(own, cli, monkeypatch
 
 def test_naming_an_installed_task_trusts_no_folder_of_that_name(at, cli):
     hostile_runs.CODE["a folder"](at)
-    refused(cli("play", "cartpole", "--checkpoint", at.run, "--viewer", "none"), (5,), "has not been used on this machine")
+    refused(
+        cli("play", "cartpole", "--checkpoint", at.run, "--viewer", "none"), (5,), "has not been used on this machine"
+    )
     assert not at.canary.exists()
 
 
