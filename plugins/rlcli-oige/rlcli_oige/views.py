@@ -118,7 +118,7 @@ class XFormPrimView(Counterpart):
         return self._env
 
     def get_world_poses(self, indices: Any = None, clone: bool = True, usd: bool = True) -> tuple[Tensor, Tensor]:
-        """Return positions [m], plus that of the environment on the grid, and orientations (w, x, y, z). (n, 3), (n, 4)"""
+        """Return positions [m], relative to the grid's origin, and orientations (w, x, y, z). (n, 3), (n, 4)"""
         position, quat = self.get_local_poses(indices)
         return position + select_rows(self._origins, self._index(indices)), quat
 
