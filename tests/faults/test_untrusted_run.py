@@ -343,4 +343,4 @@ def test_read_only_state_folder_is_not_an_error(own, cli, monkeypatch, tmp_path)
     (tmp_path / "file").touch()
     monkeypatch.setenv("RLCLI_STATE_DIR", str(tmp_path / "file"))
     assert cli("train", "./mine").code == 0
-    refused(cli("play", "--checkpoint", "latest", "--viewer", "none"), (5,), "have not used")
+    refused(cli("play", "--checkpoint", "latest", "--viewer", "none"), (5,), "has not been used")
