@@ -232,7 +232,7 @@ def index(zoo: Path, found: list[Any]) -> str:
         "- Tier A: three seeds reach the full goal within the time limit.",
         "- Tier B: one seed reaches a lower goal within the time limit.",
         "",
-        "The columns *observations, actions* have the numbers of columns of both vectors. Several values in a cell are",
+        "The column *observations, actions* has the sizes of the two vectors. Several values in a cell are",
         "those of several seeds. The time is that of the slowest seed; the page of a task names the machine of each",
         "training. The values are:",
         "",

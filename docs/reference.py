@@ -217,7 +217,7 @@ def _model(heading: str, model: dict[str, Any], links: dict[str, str]) -> Iterat
 
 
 def _terms() -> Iterator[tuple[str, TermEntry]]:
-    """Yield every built-in term with its section; randomization terms are a section of their own here."""
+    """Yield every built-in term with its section; randomisation terms are a section of their own here."""
     for entry in term_entries():
         yield ("randomization" if ".randomization" in entry.signature.module else entry.section), entry
 
@@ -261,7 +261,7 @@ def _terms_page(section: str) -> Iterator[str]:
         yield f"Every term also has the keys {own}."
         yield f"[Terms](index.md#{section}) explains them; [DelayConfig](../task-schema.md#delayconfig) is a delay.\n"
     if section in ("events", "randomization"):
-        yield "`mode` says when the change is made: `startup` once, at the start; `reset` when an episode starts;"
+        yield "`mode` sets when the change is made: `startup` once, at the start; `reset` when an episode starts;"
         yield "`interval` repeatedly, and then `interval_range_s` is required: the lowest and highest time between two"
         yield "changes [s]. [EventConfig](../task-schema.md#eventconfig) lists the keys of every event;"
         yield "[Events and randomisation](../../tutorials/first-task.md#events-and-randomisation) has examples.\n"

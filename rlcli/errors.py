@@ -146,7 +146,7 @@ class Stopped(RlcliError):
 
 
 def did_you_mean(name: str, candidates: Iterable[str]) -> str | None:
-    """Return `did you mean 'x'?` for the candidates (at most three) that are similar to a name; None without such."""
+    """Return `did you mean 'x'?` with the (at most three) candidates that are similar to a name; None if none is."""
     known = dict.fromkeys(itertools.islice(candidates, 1000))
     close = difflib.get_close_matches(name[:200], known, n=3, cutoff=0.6)
     return f"did you mean {' or '.join(repr(match) for match in close)}?" if close else None
@@ -183,7 +183,7 @@ _MAX_ERROR_TEXT = 20_000
 def error_text(error: BaseException) -> str:
     """Return the message of an error, cut to `_MAX_ERROR_TEXT` characters.
 
-    If the error's `__str__` itself raises an exception, return a text that says so.
+    If the error's `__str__` itself raises an exception, return a text that states this.
     """
     try:
         return str(error)[:_MAX_ERROR_TEXT]
@@ -192,7 +192,7 @@ def error_text(error: BaseException) -> str:
 
 
 def error_with_type(error: BaseException) -> str:
-    """Return the message of an error; if the error is no `RlcliError`, with the name of its class in front."""
+    """Return the message of an error; if the error is not a `RlcliError`, the name of its class is in front."""
     if isinstance(error, RlcliError):
         return error.message
     return ": ".join(filter(None, (type(error).__name__, error_text(error))))
@@ -204,7 +204,7 @@ def short_error(error: BaseException) -> str:
 
 
 def one_line(error: BaseException, limit: int | None = None) -> str:
-    """Return the message of an error on one line, cut to `limit` characters; without message, the name of its class."""
+    """Return the message of an error on one line, cut to `limit` characters; the name of its class if it has none."""
     text = " ".join(error_text(error).split())
     if "set_int_max_str_digits" in text:  # Python's advice does not help users of rlcli
         text = "a number has more than 4300 digits"
@@ -217,7 +217,7 @@ def require_known(name: str, names: Sequence[str], what: str, plural: str) -> No
     Args:
         name: the name that the user typed.
         names: the valid names.
-        what: noun for the message that says what the name stands for, such as `policy`.
+        what: noun for the message, which describes the name, such as `policy`.
         plural: the plural of `what`, for the hint.
 
     Raises:

@@ -349,7 +349,7 @@ def action_space(env: VecEnv, action_bound: float | None = 1.0) -> spaces.Box:
 
 
 class _Camera:
-    """Renderer of images of the first environment; OpenGL is initialized when the first image is rendered."""
+    """Renderer of images of the first environment; OpenGL is initialised when the first image is rendered."""
 
     def __init__(self, env: VecEnv) -> None:
         self._env = env

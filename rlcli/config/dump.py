@@ -257,7 +257,7 @@ def _explicit_origins(resolved: Resolved) -> list[tuple[Path, Origin]]:
 
 
 def _until_list(data: object, path: tuple[Any, ...]) -> tuple[tuple[Any, ...], Any]:
-    """Shorten a path so that it ends at the first list that it passes; return the short path and the list.
+    """Cut off a path after the first key whose value is a list; return the short path and the list.
 
     An override can change one item of a list, but a `--config` file can only replace the whole list.
     """

@@ -127,7 +127,7 @@ class Layers:
         return target[str(step)], path
 
     def _mapping(self, path: Path, origin: Origin) -> dict[str, Any]:
-        """Return the mapping at a path; create it, and replace values on the path that are no mappings."""
+        """Return the mapping at a path; create it, and replace values on the path that are not mappings."""
         target = self.data
         for depth, step in enumerate(path):
             if not isinstance(target.get(str(step)), dict):

@@ -215,7 +215,7 @@ def _unquoted(text: str, items: Iterable[Any]) -> str | None:
 def _data_path(item: Any, data: Any) -> Path:
     """Return the path of the wrong value in the data, from one of pydantic's errors (`item`).
 
-    The location in the error also has the names of union members, which are no keys of the data; they are left out.
+    The location in the error also has the names of union members, which are not keys of the data; they are left out.
     """
     path: list[str | int] = []
     location = item["loc"]

@@ -25,7 +25,7 @@ def _named_conditions(success: Mapping[str, Any]) -> dict[str, Any]:
     table = load(_TABLE.read_bytes()).data
     bounds = table["conditions"].get(str(success["func"]), {})
     if not bounds:
-        return {"success": dict(success)}  # a function of the task, which returns a truth value
+        return {"success": dict(success)}  # a function of the task, which returns a boolean
     old_keys = {"func", "hold_s", *(key for _, _, key in bounds.values())}
     others = {key: value for key, value in success.items() if key not in old_keys}
     hold = {"hold_s": success["hold_s"]} if "hold_s" in success else {}

@@ -254,7 +254,7 @@ def _import_configuration(source: TaskSource) -> tuple[Any, dict[str, Any]]:
     for part in attribute.split("."):
         if not hasattr(value, part):
             names = [n for n in vars(value) if not n.startswith("_")]
-            raise TaskError(f"{file} has no '{part}'", hint=f"names there: {listing(names)}")
+            raise TaskError(f"{file} has no '{part}'", hint=f"names in this place: {listing(names)}")
         value = getattr(value, part)
     if agents or not hasattr(value, "__rlcli_task__"):
         return value, agents
@@ -333,7 +333,7 @@ def _registered_agents(kwargs: Mapping[str, Any]) -> dict[str, Any]:
     return {
         key.removesuffix(ending).replace("_", "-"): _agent_object(value)
         for key, value in kwargs.items()
-        if key.endswith(ending) and not key.endswith(CONFIGURATION)  # `play_env_cfg_entry_point` is no agent either
+        if key.endswith(ending) and not key.endswith(CONFIGURATION)  # `play_env_cfg_entry_point` is not an agent either
     }
 
 

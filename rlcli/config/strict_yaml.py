@@ -203,7 +203,7 @@ class _Reader:
         if isinstance(event, events.ScalarEvent):
             return _scalar(event, key=False)
         if len(path) >= MAX_DEPTH:
-            raise YamlError(f"values are nested deeper than {MAX_DEPTH} levels; write them flatter", event.start_mark)
+            raise YamlError(f"values are nested deeper than {MAX_DEPTH} levels; use fewer levels", event.start_mark)
         if isinstance(event, events.MappingStartEvent):
             return self._mapping(path)
         return [self.value(item, (*path, index)) for index, item in enumerate(self._until(events.SequenceEndEvent))]

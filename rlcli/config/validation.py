@@ -303,8 +303,8 @@ class TaskCheck:
         model = load_entry(replace(entry, value=spec.algorithms[algorithm]), type)
         if not issubclass(model, AgentConfig):
             raise TaskError(
-                f"plugin {entry.distribution} {entry.version}: {model.__name__} is no subclass of AgentConfig;"
-                " report it to the plugin's authors"
+                f"plugin {entry.distribution} {entry.version}: {model.__name__} is not a subclass of AgentConfig;"
+                " report this bug to the plugin's authors"
             )
         return spec, model
 
@@ -315,7 +315,7 @@ class TaskCheck:
         data = {key: value for key, value in self.layers.data.items() if key not in PATCHES}
         self.format = formats.format_of_key(foreign_keys(data)) or self.format
         if "foreign" in data:
-            message = "a task file has no key 'foreign': settings of another framework stand at the top level"
+            message = "a task file has no key 'foreign': settings of another framework belong at the top level"
             self.problem(("foreign",), message, "write the framework's own key, such as 'oige', without 'foreign'")
         for section in [name for name in SECTIONS if isinstance(_mapping(data.get(name)).get("func"), str)]:
             func = data.pop(section)["func"]

@@ -23,7 +23,7 @@ def actuator_models(env: VecEnv, terms: Iterable[BoundTerm], controls: list[dict
     Args:
         env: the environment.
         terms: the action terms.
-        controls: the description of each action term. Its key `closed`, as in each description of a formula, says
+        controls: the description of each action term. Its key `closed`, as in each description of a formula, states
             whether the formula needs nothing from the task's code.
     """
     pairs = list(zip(terms, controls, strict=False))

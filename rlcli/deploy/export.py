@@ -122,7 +122,7 @@ def export(
         write_synced(temporary, formats.write(format_, graph, text, mjlab_properties(metadata)))
         run, found = formats.read(format_, temporary)
         if json.loads(found) != metadata:
-            raise VerdictError(f"{file} was not kept: its metadata cannot be read back", hint="report this bug")
+            raise VerdictError(f"{file} was not written: its metadata cannot be read back", hint="report this bug")
         difference = _require_equal(run, graph, observations, file)
     return Exported(file, metadata, len(observations), difference)
 
@@ -168,8 +168,8 @@ def _require_equal(run: PolicyFunction, graph: DeployedPolicy, observations: Ten
                 difference = relative_difference(found[name], values)
                 if found[name].shape != values.shape or not bool((difference <= TOLERANCE).all()):
                     raise VerdictError(
-                        f"{file} was not kept: with batch size {batch}, file and policy have outputs '{name}' with the"
-                        f" relative difference {float(difference.max()):.3g}; at most {TOLERANCE:g} is allowed",
+                        f"{file} was not written: with batch size {batch}, its output '{name}' differs from that of the"
+                        f" policy by {float(difference.max()):.3g} (relative); at most {TOLERANCE:g} is allowed",
                         hint="report this bug with the versions of torch, onnx and onnxruntime",
                     )
                 worst = max(worst, float(difference.max()))

@@ -55,7 +55,7 @@ def metadata_of(
                 "what reaches the actuators, in the `unit` of each term of `actions`: action x `scale` + `offset`,"
                 " clipped to `clip`, then to `limits`. If `command` of a term is 'actuator model', this is the target"
                 " of the models in `deployment.actuator_models`, which compute forces or torques from it in every"
-                " physics step: it is no control of MuJoCo. If `command` of a term is 'task', this is the action"
+                " physics step: it is not a control of MuJoCo. If `command` of a term is 'task', this is the action"
                 " clipped to `clip`, and the task's own code computes the actuators' command from it"
             ),
         },

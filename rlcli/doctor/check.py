@@ -10,7 +10,7 @@ class Check:
 
     name: str
     state: str
-    """ok: works; absent: an optional extra is not installed, which is no fault; warning: something will not work, or
+    """ok: works; absent: an optional extra is not installed, which is not a fault; warning: something will not work, or
     will work badly; broken: something that is installed or configured does not work."""
     found: str
     hint: str | None = None

@@ -36,7 +36,7 @@ class SuccessCondition:
         self.bounded = (self._low, self._high) != (None, None)
         if self.bounded == (first.dtype == torch.bool):
             if self.bounded:
-                raise term.error(f"'{config.func}' returns a truth value; remove at_most and at_least")
+                raise term.error(f"'{config.func}' returns a boolean; remove at_most and at_least")
             raise term.error(f"'{config.func}' returns a number; add at_most or at_least")
         self.hold_steps = max(1, math.ceil(config.hold_s / step_dt - 1e-6))  # the slack absorbs rounding
         self.steps = torch.zeros_like(lengths, dtype=torch.float32)

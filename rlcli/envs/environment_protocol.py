@@ -88,8 +88,8 @@ class Environment(Protocol):
                 (num_envs,) bool
 
         Raises:
-            DivergedError: for an action, observation or reward that is not finite. A diverged simulation is no error:
-                it ends the episode of its environment.
+            DivergedError: for an action, observation or reward that is not finite. A diverged simulation is not
+                an error: it ends the episode of its environment.
         """
 
     def compute_success(self) -> Tensor | None:

@@ -2,7 +2,7 @@
 
 The linear model is identified from the environment: one step from each of many states near the default state, with
 small actions. The regulator uses the policy's observations and actions. A task has no regulator if its default state is
-not an equilibrium, if the observations do not determine the state, or if no linear feedback stabilizes the default
+not an equilibrium, if the observations do not determine the state, or if no linear feedback stabilises the default
 state.
 """
 
@@ -33,7 +33,7 @@ _SINGULAR = 1e-4
 """Fraction of the largest singular value of the observations below which a singular value is a rounding error."""
 _MAX_ITERATIONS = 100_000
 _MAX_COST = 1e12
-"""Largest cost of a state of length 1; with a higher cost, the system counts as one that no feedback stabilizes."""
+"""Largest cost of a state of length 1; with a higher cost, the system counts as one that no feedback stabilises."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,12 +101,12 @@ def regulator(resolved: Resolved, bound: float | None) -> Regulator:
     gain = riccati(a, b, np.eye(nx), np.eye(b.shape[1]) / (bound or 1.0) ** 2)
     poles = tuple(sorted(np.abs(np.linalg.eigvals(a - b @ gain)).tolist(), reverse=True)) if gain is not None else ()
     if gain is None or poles[0] >= 1.0:
-        raise _no_regulator_error(resolved, "no linear feedback stabilizes the default state")
+        raise _no_regulator_error(resolved, "no linear feedback stabilises the default state")
     return Regulator(gain @ decoder.T, rest, bound, poles)
 
 
 def riccati(a: Matrix, b: Matrix, q: Matrix, r: Matrix) -> Matrix | None:
-    """Return the gain k of the feedback u = -k x that minimizes the sum of x'qx + u'ru; None if there is no such gain.
+    """Return the gain k of the feedback u = -k x that minimises the sum of x'qx + u'ru; None if there is no such gain.
 
     x is the state, u the input, and the next state is a x + b u.
 

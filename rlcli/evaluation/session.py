@@ -135,7 +135,7 @@ def find_policy(request: PolicyRequest, check: Callable[[Resolved], None] = lamb
 
 
 def split_overrides(task: str | None, overrides: Sequence[str]) -> tuple[str | None, list[str]]:
-    """Return the task and the overrides of a command line, where TASK is optional and stands before the overrides.
+    """Return the task and the overrides of a command line, where TASK is optional and comes before the overrides.
 
     If the first word has a `=`, it is an override, and the task is None.
     """

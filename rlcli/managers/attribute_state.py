@@ -235,7 +235,7 @@ def _from_json(written: object) -> Any:
     if kind == "scalar":
         dtype = np.dtype(content[0])
         if dtype.kind not in "biuf":
-            raise ValueError(f"a saved value has the type '{content[0]}', which is no number: the file is damaged")
+            raise ValueError(f"a saved value has the type '{content[0]}', which is not a number: the file is damaged")
         return dtype.type(content[1])
     if kind == "dict":
         return {_from_json(key): _from_json(item) for key, item in content[0]}

@@ -75,7 +75,7 @@ class TunableValues:
                     rest = ".".join(path[depth + 1 :])
                     message = f"a curriculum cannot change '{address}': the setting has no element '{rest}'"
                     raise NameProblem(message) from None
-        raise NameProblem(f"a curriculum cannot change '{address}', which is no number and no list of numbers")
+        raise NameProblem(f"a curriculum cannot change '{address}', which is neither a number nor a list of numbers")
 
     def _tensor(self, path: Path, value: object) -> Tensor:
         if path not in self._tensors:

@@ -194,7 +194,7 @@ def make_delay(term: BoundTerm, width: int, context: EnvContext) -> Delay | None
     """Return the delay of an observation or action term; None if the term has no delay, or a delay of 0 steps.
 
     Raises:
-        ShapeError: for a delay in seconds that is no multiple of the control period `step_dt` [s].
+        ShapeError: for a delay in seconds that is not a multiple of the control period `step_dt` [s].
     """
     config: schema.DelayConfig | None = term.config.delay  # type: ignore[attr-defined]
     if config is None:

@@ -318,7 +318,7 @@ class CheckedTerm:
         term: the term.
         value: the first value of the term.
         shape: the shape that each value must have.
-        is_mask: whether the values are truth values, such as the values of terminations.
+        is_mask: whether the values are booleans, such as the values of terminations.
 
     Raises:
         ShapeError: if the first value is wrong. A call raises a ShapeError for a later value that is wrong.
@@ -358,5 +358,5 @@ class CheckedTerm:
             if self._is_mask:
                 return value.bool()
             return value.float() if value.is_floating_point() and value.dtype not in _DTYPES else value
-        wanted = f"a tensor of shape {self._shape}{' of truth values' if self._is_mask else ''}"
+        wanted = f"a tensor of shape {self._shape}{' of booleans' if self._is_mask else ''}"
         raise self._term.error(f"'{self._term.config.func}' returned {found}; return {wanted}")

@@ -169,7 +169,7 @@ class NormalVelocity(_VelocityCommand):
     zero_prob: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def resample(self, selection: Selection) -> None:
-        """Draw velocities, those that are zero, and the environments in which the robot is to stand."""
+        """Draw the velocities, which of them are set to zero, and in which environments the robot is to stand."""
         for column, (mean, std, zero) in enumerate(zip(self.mean, self.std, self.zero_prob, strict=True)):
             value = selection.normal(mean, std)
             selection.write(self._drawn[:, column], value * (selection.uniform(0.0, 1.0) >= zero))

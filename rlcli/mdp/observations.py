@@ -249,9 +249,9 @@ def height_scan(env: ManagedEnv, *, sensor: RaySensor, offset: float = 0.5) -> T
 
 
 def image(env: ManagedEnv, *, sensor: CameraSensor, normalize: bool = True) -> Tensor:
-    """Image of a camera, rows from the top: colors, distances [m] or ids of bodies. (num_envs, c, h, w)
+    """Image of a camera, rows from the top: colours, distances [m] or ids of bodies. (num_envs, c, h, w)
 
-    A distance is 0 where nothing is visible. Colors are 0 to 255; with `normalize` they are divided by 255, and the
+    A distance is 0 where nothing is visible. Colours are 0 to 255; with `normalize` they are divided by 255, and the
     mean of each channel of the image is subtracted. Isaac Lab: channels last.
     """
     image = sensor.image.movedim(-1, 1).float().contiguous()

@@ -11,7 +11,7 @@ from rlcli.task import Bodies, Joints, Sites
 
 
 def joint_error(env: VecEnv, *, entity: Entity = "robot", joints: Joints = ".*", target: float = 0.0) -> Tensor:
-    """Return the largest distance of a joint from `target` [m or rad]. (num_envs,)
+    """Largest distance of a joint from `target` [m or rad]. (num_envs,)
 
     The difference is wrapped to [-pi, pi].
     """
@@ -23,7 +23,7 @@ def joint_error(env: VecEnv, *, entity: Entity = "robot", joints: Joints = ".*",
 def root_velocity(
     env: VecEnv, *, entity: Entity = "robot", direction: tuple[float, float, float] = (1.0, 0.0, 0.0)
 ) -> Tensor:
-    """Return the root's velocity along `direction` [m/s]. (num_envs,)
+    """Velocity of the root along `direction` [m/s]. (num_envs,)
 
     direction: unit vector, world frame.
     """
@@ -32,22 +32,22 @@ def root_velocity(
 
 
 def root_speed(env: VecEnv, *, entity: Entity = "robot") -> Tensor:
-    """Return the magnitude of the root's velocity [m/s]. (num_envs,)"""
+    """Magnitude of the root's velocity [m/s]. (num_envs,)"""
     return length(entity.data.root_lin_vel_w)
 
 
 def root_tilt(env: VecEnv, *, entity: Entity = "robot") -> Tensor:
-    """Return the angle between the root's up axis and the world's [rad]. (num_envs,)"""
+    """Angle between the root's up axis and the world's [rad]. (num_envs,)"""
     return (-entity.data.projected_gravity_b[:, 2]).clamp(-1.0, 1.0).acos()
 
 
 def root_height(env: VecEnv, *, entity: Entity = "robot") -> Tensor:
-    """Return the height of the root above its environment's origin [m]. (num_envs,)"""
+    """Height of the root above its environment's origin [m]. (num_envs,)"""
     return entity.data.root_pos_w[:, 2] - env.origins[:, 2]
 
 
 def root_distance(env: VecEnv, *, entity: Entity = "robot", target: tuple[float, float, float]) -> Tensor:
-    """Return the distance of the root from `target` [m]. (num_envs,)
+    """Distance of the root from `target` [m]. (num_envs,)
 
     target: a point from the environment's origin [m].
     """
@@ -55,22 +55,22 @@ def root_distance(env: VecEnv, *, entity: Entity = "robot", target: tuple[float,
 
 
 def root_distance_to(env: VecEnv, *, entity: Entity = "robot", goal: Entity = "target") -> Tensor:
-    """Return the distance of the root from the root of `goal` [m]. (num_envs,)"""
+    """Distance of the root from the root of `goal` [m]. (num_envs,)"""
     return length(entity.data.root_pos_w - goal.data.root_pos_w)
 
 
 def velocity_error(env: VecEnv, *, entity: Entity = "robot", command: Command) -> Tensor:
-    """Return the error of the root's horizontal velocity under a velocity command [m/s], root frame. (num_envs,)"""
+    """Error of the root's horizontal velocity under a velocity command [m/s], root frame. (num_envs,)"""
     return length(command.command[:, :2] - entity.data.root_lin_vel_b[:, :2])
 
 
 def yaw_rate_error(env: VecEnv, *, entity: Entity = "robot", command: Command) -> Tensor:
-    """Return the error of the root's yaw rate under a velocity command [rad/s], root frame. (num_envs,)"""
+    """Error of the root's yaw rate under a velocity command [rad/s], root frame. (num_envs,)"""
     return (command.command[:, 2] - entity.data.root_ang_vel_b[:, 2]).abs()
 
 
 def mean_velocity_error(env: ManagedEnv, *, command: Command) -> Tensor:
-    """Return the mean error of a velocity command's horizontal velocity over the episode so far [m/s]. (num_envs,)
+    """Mean error of a velocity command's horizontal velocity over the episode so far [m/s]. (num_envs,)
 
     The mean includes the start of the episode and changes of the command.
     """
@@ -78,7 +78,7 @@ def mean_velocity_error(env: ManagedEnv, *, command: Command) -> Tensor:
 
 
 def mean_yaw_rate_error(env: ManagedEnv, *, command: Command) -> Tensor:
-    """Return the mean error of a velocity command's yaw rate over the episode so far [rad/s]. (num_envs,)
+    """Mean error of a velocity command's yaw rate over the episode so far [rad/s]. (num_envs,)
 
     The mean includes the start of the episode and changes of the command.
     """
@@ -86,22 +86,22 @@ def mean_yaw_rate_error(env: ManagedEnv, *, command: Command) -> Tensor:
 
 
 def body_goal_distance(env: VecEnv, *, entity: Entity = "robot", bodies: Bodies, command: Command) -> Tensor:
-    """Return the distance of a body from the goal of a pose command of `entity` [m]. (num_envs,)"""
+    """Distance of a body from the goal of a pose command of `entity` [m]. (num_envs,)"""
     return distance_to_goal(entity, bodies, command)
 
 
 def body_goal_angle(env: VecEnv, *, entity: Entity = "robot", bodies: Bodies, command: Command) -> Tensor:
-    """Return the angle of a body from the goal orientation of a pose command of `entity` [rad]. (num_envs,)"""
+    """Angle of a body from the goal orientation of a pose command of `entity` [rad]. (num_envs,)"""
     return angle_to_goal(entity, bodies, command)
 
 
 def site_goal_distance(env: VecEnv, *, entity: Entity = "robot", sites: Sites, command: Command) -> Tensor:
-    """Return the distance of a site from the goal of a pose command of `entity` [m]. (num_envs,)"""
+    """Distance of a site from the goal of a pose command of `entity` [m]. (num_envs,)"""
     return length(single(entity.data.site_pos_w[:, sites], "site") - goal_in_world(entity, command))
 
 
 def object_goal_distance(
     env: VecEnv, *, entity: Entity = "robot", object: Entity = "object", command: Command
 ) -> Tensor:
-    """Return the distance of an object from the goal of a pose command of `entity` [m]. (num_envs,)"""
+    """Distance of an object from the goal of a pose command of `entity` [m]. (num_envs,)"""
     return length(object.data.root_pos_w - goal_in_world(entity, command))

@@ -60,7 +60,7 @@ def joint_vel_out_of_limit(env: ManagedEnv, *, entity: Entity = "robot", joints:
 
 
 def joint_effort_out_of_limit(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
-    """End the episode if the effort of any actuator would exceed its limit without the limit. (num_envs,)
+    """End the episode if the effort of any actuator, before it is clipped, exceeds the effort limit. (num_envs,)
 
     For MuJoCo's own actuators, this effort is computed from the present state and controls. Isaac Lab checks actuator
     models only (its explicit actuators), with values of the last physics step.

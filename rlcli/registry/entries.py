@@ -110,7 +110,7 @@ def _plugin_points(distribution: metadata.Distribution) -> dict[str, list[metada
             found[point.group].append(point)
     for group, points in found.items():
         if len(points) > MAX_ENTRIES[group]:
-            raise ValueError(f"{len(points)} entry points in {group}, at most {MAX_ENTRIES[group]} are allowed")
+            raise ValueError(f"{len(points)} entry points in {group}; at most {MAX_ENTRIES[group]} are allowed")
     return found
 
 

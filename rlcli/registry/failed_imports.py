@@ -22,7 +22,7 @@ _LIBRARIES = tuple(path for name, path in sysconfig.get_paths().items() if name.
 
 
 class FailedImport:
-    """Replacement of a module whose import failed, and of its members. Its use raises the error of the import."""
+    """Replacement for a module whose import failed, and of its members. Its use raises the error of the import."""
 
     __all__: tuple[str, ...] = ()
 

@@ -21,8 +21,8 @@ KEYWORDS = ("latest", "shipped")
 def path_of(word: str) -> Path:
     """Return the path that a word of the command line names.
 
-    A keyword, also before an @, is never a file: the path returned for it does not exist. Write `./latest` to name a
-    folder called `latest`.
+    A keyword (`latest`, also in `latest@best`) never names a file: the returned path does not exist. Write `./latest`
+    for a folder called `latest`.
     """
     return Path(os.devnull, word) if word.partition("@")[0] in KEYWORDS else Path(word)
 

@@ -125,7 +125,7 @@ def _plugin_named(entry: Entry, failure: str, passed_on: type[RlcliError]) -> It
 
 
 def import_object(reference: str) -> Any:
-    """Import and return the object of a reference `package.module:Name`. What the import prints goes to stderr."""
+    """Import and return the object of a reference `package.module:Name`. The output of the import goes to stderr."""
     name, _, attributes = reference.rpartition(":")
     if not name:
         raise ValueError("the reference names no object of a module; write MODULE:OBJECT")
@@ -136,7 +136,7 @@ def import_object(reference: str) -> Any:
 
 @contextlib.contextmanager
 def contain_side_effects() -> Iterator[None]:
-    """Send what the `with` block prints to stderr, also from C code, and undo its changes of the current folder.
+    """Redirect the output of the `with` block to stderr, also that of C code, and restore the current folder.
 
     Two more kinds of changes are undone, with a warning: torch's default dtype, default device and gradient mode, on
     which rlcli's own tensors depend; and built-in functions that were deleted or replaced by a value.

@@ -93,7 +93,7 @@ def _known_details(entry: Entry, cache: dict[str, Any]) -> Details | None:
         return shipped
     probed = _parse_details(cache.get(_key(entry)))
     if probed is not None and probed.broken:
-        return probed  # the task is broken on this machine, whatever the plugin's own index says
+        return probed  # the task is broken on this machine, whatever the plugin's own index contains
     return shipped or probed
 
 
@@ -319,7 +319,7 @@ def _read_json(file: Path) -> dict[str, Any]:
 
 
 def _parse_details(row: object) -> Details | None:
-    """Return the `Details` in a JSON value of an untrusted file; None if the value is no mapping or a type is wrong."""
+    """Return the `Details` in a JSON value of an untrusted file; None if the value or a type is wrong."""
     if not isinstance(row, dict):
         return None
     known = {f.name: row[f.name] for f in fields(Details) if f.name in row}

@@ -157,8 +157,8 @@ def _libraries() -> list[Path]:
 def observe_task_code() -> Iterator[None]:
     """Report what the code of tasks and plugins does in the `with` block, each as one warning in rlcli's log.
 
-    Reported are warnings of this code, records of its loggers without a handler, errors in its threads and destructors,
-    and calls that have not returned after `SLOW_S`. Each line of code is reported once.
+    The reports are warnings of this code, records of its loggers without a handler, errors in its threads and
+    destructors, and calls that have not returned after `SLOW_S`. Each line of code is reported once.
     """
     # an earlier command of this process may have filled these caches
     for function in (warn_once, is_task_file, _plugins):
@@ -246,7 +246,7 @@ def _innermost_place(frames: Iterable[FrameType]) -> str | None:
 def frames_of_thread(thread: int | None) -> list[FrameType]:
     """Return the frames of a thread, innermost first, up to the start of the command.
 
-    The garbage collector is off meanwhile: Python 3.11 collects inside of `f_back`. If a finalizer then lets the thread
+    The garbage collector is off meanwhile: Python 3.11 collects inside of `f_back`. If a finaliser then lets the thread
     continue, `f_back` reads freed memory, and the process may crash.
 
     Args:

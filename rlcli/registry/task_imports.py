@@ -73,7 +73,7 @@ def load_module(name: str) -> Any:
 def import_file(file: Path) -> Any:
     """Import a file as a module of its folder's package, so that its relative imports work.
 
-    If the folder is no package, the file can import the modules beside it, as a script can.
+    If the folder is not a package, the file can import the modules beside it, as a script can.
     """
     with contain_side_effects(), _registrations_kept():
         top = file.parent

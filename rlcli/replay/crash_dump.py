@@ -128,7 +128,7 @@ def describe_traces(
         resolved: the configuration.
         follows_constants: whether the constants that MuJoCo derives from a model (`mj_setConst`) are derived again from
             each environment's own model fields.
-        diverged: whether the calls end in a divergence; its physics step is then searched.
+        diverged: whether the calls end in a divergence; if so, its physics step is found and stored.
 
     Returns:
         The `World` of each environment for the file's header, and the file's tensors (`world.K.*`), by name.

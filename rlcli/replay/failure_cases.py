@@ -128,7 +128,7 @@ class FailureCase:
 def list_failure_cases(run: Run) -> list[FailureCase]:
     """Return the failure cases of a run, the oldest first; at most 10,000 files are read.
 
-    A file that cannot be read, or is no failure case, is skipped with a warning.
+    A file that cannot be read, or is not a failure case, is skipped with a warning.
 
     Raises:
         CheckpointError: if the folder of failure cases is outside the run.

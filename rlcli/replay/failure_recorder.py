@@ -318,7 +318,7 @@ class FailureRecorder(StepObserver):
         self._pending[key] = KeptEpisode(value, key[0], episode, trace, tensors, self._engine.own_constants)
 
     def _fences(self) -> tuple[float, float]:
-        """Return the lowest and the highest return that is no outlier; infinite before there are `LEAST` returns."""
+        """Return the lowest and highest return that is not an outlier; infinite before there are `LEAST` returns."""
         if self._quartiles is None:
             return -np.inf, np.inf
         first, third = self._quartiles

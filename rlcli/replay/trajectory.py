@@ -255,8 +255,8 @@ class Header(_Strict):
         """Check that the numbers of steps, calls and episodes fit each other and the kind of the file."""
         for world in self.worlds:
             if len(world.follows) != len(world.nstep) - 1 or world.first >= len(world.nstep):
-                message = f"the lists `nstep` and `follows` of environment {world.env}, or its number `first`"
-                raise ValueError(f"{message}, do not fit together")
+                message = f"`nstep`, `follows` and `first` of environment {world.env} do not fit together"
+                raise ValueError(f"the file is damaged: {message}")
         if sum(count for world in self.worlds for count in world.nstep) > MAX_SUBSTEPS:
             raise ValueError(f"the file is damaged: it has more than {MAX_SUBSTEPS} physics steps")
         for number, e in enumerate(self.episodes):
@@ -304,7 +304,7 @@ class Trajectory:
 
         Raises:
             TaskError: if the task is not installed any more.
-            CheckpointError: if the user has never named the task's code on this machine, so that it is not trusted; or
+            CheckpointError: if the task's code is not trusted (see `recorded_task`); or
                 if header and configuration do not agree.
             ConfigError: if the installed task does not accept the recorded configuration.
         """
@@ -377,7 +377,7 @@ def read_trajectory(file: Path) -> Trajectory:
         message = f"there is no recording, crash dump or failure case {file}"
         raise CheckpointError(message, hint="check the path; rlcli eval TASK --record FILE makes a recording") from None
     except (SafetensorError, OSError, ValueError, RecursionError) as error:
-        message = f"{file} is no valid recording, crash dump or failure case: {' '.join(str(error).split())}"
+        message = f"{file} is not a valid recording, crash dump or failure case: {' '.join(str(error).split())}"
         raise CheckpointError(message, hint="check the path; rlcli eval TASK --record FILE makes a recording") from None
     return Trajectory(file, header, tensors)
 
@@ -397,7 +397,7 @@ def _check_tensors(header: Header, tensors: Mapping[str, Tensor]) -> None:
     """Check the shapes and types of the tensors that a replay reads.
 
     Raises:
-        ValueError: if a tensor is missing, or has another shape or type than the header says.
+        ValueError: if a tensor is missing, or has another shape or type than in the header.
     """
     shapes: dict[str, tuple[int | None, ...]] = {}
     if header.kind == "recording":

@@ -1,6 +1,6 @@
 """Heat maps of `rlcli stress`: a metric of the policy for each pair of values of two varied parameters.
 
-All heat maps of a stress test, one for each policy, have the same color scale.
+All heat maps of a stress test, one for each policy, have the same colour scale.
 """
 
 import io

@@ -139,7 +139,7 @@ def markdown(content: Card, level: int = 1) -> str:
 # --- the tables ---
 
 _KINDS = {
-    **dict.fromkeys(("Term", "Of", "Name", "Drives", "Condition", "Hook"), CODE),
+    **dict.fromkeys(("Term", "Elements", "Name", "Drives", "Condition", "Hook"), CODE),
     **dict.fromkeys(("Size", "Scale", "Weight"), NUMBER),
 }
 """Title of a column -> its kind; columns with other titles are text."""
@@ -180,7 +180,19 @@ def _observations(task: TaskConfig, vocabulary: Vocabulary, layout: Mapping[str,
             note = f"{columns_text(sum(term['size'] for term in terms))}."
             yield Table(f"Observations: {group}", note, _columns("Name", "Unit", "Size", "Clip"), tuple(rows))
         return
-    titles = ("Term", "What", "Unit", "Size", "Of", "Parameters", "Modifiers", "Noise", "Bias", "Clip", "Scale")
+    titles = (
+        "Term",
+        "Meaning",
+        "Unit",
+        "Size",
+        "Elements",
+        "Parameters",
+        "Modifiers",
+        "Noise",
+        "Bias",
+        "Clip",
+        "Scale",
+    )
     columns = _columns(*titles, "Delay", "History")
     for name, group in task.observations.items():
         layouts = {term["name"]: term for term in compiled.get(name, [])}
@@ -243,7 +255,7 @@ def _actions(task: TaskConfig, vocabulary: Vocabulary, layout: Mapping[str, Any]
         )
     if not task.actions:
         rows = [(name, "", term.get("unit", ""), "", *_compiled_action(term), "") for name, term in layouts.items()]
-    columns = _columns("Term", "What", "Unit", "Parameters", "Size", "Drives", "Limits", "Delay")
+    columns = _columns("Term", "Meaning", "Unit", "Parameters", "Size", "Drives", "Limits", "Delay")
     return Table("Actions", "", columns, tuple(rows))
 
 
@@ -285,13 +297,13 @@ def _term_tables(task: TaskConfig, vocabulary: Vocabulary) -> Iterable[Table]:
     yield table("terminations", note, titles, lambda term, meaning, unit: (ends[term.time_out], meaning))
     note = "An episode succeeds if it ends by time-out and each condition held during its last seconds."
     yield table("success", note, ("Condition", "Value", "Must be", "For [s]", "Parameters"), _condition_cells)
-    titles = ("Term", "What", "Unit", "Resampled", "Ranges")
+    titles = ("Term", "Meaning", "Unit", "Resampled", "Ranges")
     yield table(
         "commands", "", titles, lambda term, meaning, unit: (meaning, unit, f"every {span(term.resampling_time_s)} s")
     )
-    titles = ("Term", "When", "What", "Ranges and parameters")
+    titles = ("Term", "When", "Meaning", "Ranges and parameters")
     yield table("events", "", titles, lambda term, meaning, unit: (when_text(term), meaning))
-    yield table("curriculum", "", ("Term", "What", "Parameters"), lambda term, meaning, unit: (meaning,))
+    yield table("curriculum", "", ("Term", "Meaning", "Parameters"), lambda term, meaning, unit: (meaning,))
 
 
 def _condition_cells(term: Any, meaning: str, unit: str) -> tuple[str, ...]:
@@ -348,10 +360,10 @@ def _direct(task: TaskConfig, source: TaskSource | None) -> Iterable[Table]:
                 for key, field in (params.model_fields.items() if params else ())
             }
     rows = [(key, text_of(value), *described.get(key, ("", ""))) for key, value in values.items()]
-    columns = (Column("Parameter", CODE), Column("Value", NUMBER), Column("What"), Column("Default", NUMBER))
+    columns = (Column("Parameter", CODE), Column("Value", NUMBER), Column("Meaning"), Column("Default", NUMBER))
     yield Table("Parameters", "", columns, tuple(rows))
     note = "The docstrings of the task's class. Its code is the definition."
-    yield Table("Docstrings of the task", note, _columns("Decides", "Hook", "What"), tuple(hooks))
+    yield Table("Docstrings of the task", note, _columns("Part of the task", "Hook", "Meaning"), tuple(hooks))
 
 
 def _hooks(file: Path, class_name: str) -> list[tuple[str, str, str]]:

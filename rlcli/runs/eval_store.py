@@ -80,11 +80,15 @@ def write_evaluation(run: Run, step_name: str, document: Mapping[str, Any]) -> P
 def read_evaluation(run: Run, step_name: str) -> dict[str, Any] | None:
     """Return the saved result of `rlcli eval` for a run's checkpoint; None if there is none.
 
-    These entries of the result are checked: `episodes`, `seed`, `return` and `length` (mean, std, low, high; for a
-    single episode low and high are None), `reward_terms` (mean, std, low, high of each term, by name), `terminations`
-    (rate, low, high of each term, by name), `diverged`, `diverged_by`. `success` (rate, low, high) and `conditions` (by
-    name: `held`, a share; `value`, a mean, `at_least` and `at_most`, where the condition has them) are missing for a
-    task without success conditions.
+    These entries of the result are checked:
+
+    - `episodes`, `seed`, `diverged`, `diverged_by`
+    - `return`, `length`: mean, std, low, high; for a single episode low and high are None
+    - `reward_terms`: name of a term -> mean, std, low, high
+    - `terminations`: name of a term -> rate, low, high
+    - `success`: rate, low, high; missing for a task without success conditions
+    - `conditions`: name of a success condition -> `held` (rate, low, high), `at_least` or `at_most` if the condition
+      has such a limit, and `value` (mean, std, low, high) if the condition has a value; missing in the same case
 
     Args:
         run: the run.

@@ -65,7 +65,9 @@ class _Simulation:
             case "GLOBAL" if argument in _ALLOWED:
                 stack.append(_Value(argument))
             case "GLOBAL":
-                raise _RefusedError(f"names '{argument[:80]}', which is not a tensor")
+                raise _RefusedError(
+                    f"refers to '{argument[:80]}'; only tensors, numbers, text, lists and dictionaries are allowed"
+                )
             case "BINUNICODE" | "SHORT_BINSTRING":
                 stack.append(_Value(is_key=True))
             case "BININT" | "BININT1" | "BININT2" | "LONG1":
@@ -97,7 +99,7 @@ class _Simulation:
                 stack.append(_result(function.kind, arguments))
             case "BINPERSID":  # BINPERSID makes a storage: torch uses an item of this tuple as the key of a dictionary
                 if stack.pop().depth > 1:
-                    raise _RefusedError("has a tensor whose storage is named by something else than text")
+                    raise _RefusedError("has a tensor whose storage has a name that is not text")
                 stack.append(_Value())
             case "BINPUT" | "LONG_BINPUT":
                 self.memo[argument] = stack[-1]
@@ -107,7 +109,7 @@ class _Simulation:
                 pass
             case _:
                 what = "creates objects" if opcode in _REFUSED_OPCODES else f"has the operation {opcode}"
-                raise _RefusedError(f"{what}, which is not a tensor")
+                raise _RefusedError(f"{what}; only tensors, numbers, text, lists and dictionaries are allowed")
 
     def _since_mark(self) -> list[_Value]:
         items = self.stack
@@ -125,7 +127,9 @@ class _Simulation:
 
     def _build(self, state: _Value) -> None:
         if state.kind != "dict":
-            raise _RefusedError("sets attributes, which is not a tensor")
+            raise _RefusedError(
+                "sets attributes of an object; only tensors, numbers, text, lists and dictionaries are allowed"
+            )
         self._add("dict", [state])
 
     def _add(self, kind: str, items: Iterable[_Value]) -> None:
@@ -136,7 +140,9 @@ class _Simulation:
             outer.depth = max(outer.depth, item.depth + 1)
             outer.size += item.size
         if outer.kind != kind or outer.stored:
-            raise _RefusedError("changes a value that is no list or dictionary, or is a part of another one")
+            raise _RefusedError(
+                "changes a value that is not a list or dictionary, or that is already part of another value"
+            )
         if outer.depth > _MAX_DEPTH:
             raise _RefusedError(f"has values nested deeper than {_MAX_DEPTH} levels")
         if outer.size > MAX_BYTES:
@@ -152,7 +158,7 @@ def _result(function: str, arguments: _Value) -> _Value:
     if function in _FUNCTIONS:
         return _Value()
     if function != _ORDERED_DICT or (arguments.kind, arguments.size) != ("tuple", 1):
-        raise _RefusedError("calls something that does not make a tensor")
+        raise _RefusedError("calls a function that does not create a tensor")
     return _Value("dict", depth=1)
 
 

@@ -55,7 +55,9 @@ class Choice:
         if named is not None:
             return named
         if not record.get("distribution"):
-            message = f"{self.folder} is a policy for '{record['name']}', which was not an installed task"
+            message = (
+                f"{self.folder} is a policy for the task '{record['name']}', which is not part of an installed package"
+            )
             hint = f"name the folder of the task: `rlcli play FOLDER --checkpoint {self.folder}`"
             raise CheckpointError(message, hint=hint)
         return recorded_task(record, f"the task of {self.folder}")

@@ -29,7 +29,7 @@ def source_of(run: Run, named: TaskSource | None = None) -> TaskSource:
 
     Raises:
         TaskError: if the task is not installed any more.
-        CheckpointError: if the run names code that the user has never named on this machine.
+        CheckpointError: if the task's code is not trusted, because the user has never used it on this machine.
     """
     source = recorded_task(run.record["task"], f"the task of {run.folder}", str(run.folder), named)
     with read_errors(run.config):
@@ -50,7 +50,7 @@ def recorded_task(
 
     Raises:
         TaskError: if the task is not installed any more.
-        CheckpointError: if the record names code that the user has never named on this machine.
+        CheckpointError: if the task's code is not trusted, because the user has never used it on this machine.
     """
     owner = record.get("distribution")
     try:
@@ -93,8 +93,10 @@ def _untrusted_code_error(record: Mapping[str, Any], what: str, run: str | None)
     code = trusted_tasks.named_code(record)
     name = shlex.quote(code if os.sep in code or "/" in code else f"./{code}")
     allow = f"--task {name}" if run is None else f"rlcli play {name} --checkpoint {shlex.quote(run)}"
-    message = f"{what} is not loaded: it names code that you have not used on this machine, {code}"
-    return CheckpointError(message, hint=f"if you trust that code, or have it elsewhere, name it once: {allow}")
+    message = f"{what} is not loaded: its code, {code}, has not been used on this machine before"
+    return CheckpointError(
+        message, hint=f"if you trust this code, or have a copy of it at another path, give its path once: {allow}"
+    )
 
 
 def resolve_run(

@@ -323,7 +323,7 @@ class TaskRecord(FileModel):
 
 
 class RecordedTask(TaskRecord):
-    """Entry `task` of run.json, which must say where the task comes from: a folder or an installed distribution."""
+    """Entry `task` of run.json, which must name the source of the task: a folder or an installed distribution."""
 
     @model_validator(mode="after")
     def _check_origin(self) -> Self:

@@ -131,7 +131,7 @@ def _checkpoint_differences(left: Run, right: Run, steps: Sequence[int]) -> Iter
 
 
 def _parts(one: Checkpoint, other: Checkpoint) -> list[str]:
-    """Return the names of the tensor files of two checkpoints without suffix: policy, trainer, then the others."""
+    """Return the names of the tensor files of two checkpoints without the suffix: policy, trainer, then the others."""
     names = {name for saved in (one, other) for name in saved.manifest["files"] if name.endswith(".safetensors")}
     order = ("policy.safetensors", "trainer.safetensors")
     ordered = sorted(names, key=lambda name: (order.index(name) if name in order else len(order), name))

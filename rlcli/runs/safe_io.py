@@ -26,6 +26,7 @@ _MAX_DEPTH = 32
 _MAX_DIGITS = 20
 _NOT_A_FILE = (errno.ELOOP, errno.ENXIO, errno.EISDIR)
 """Errors of open() for links, pipes, sockets and folders."""
+_CHECK_ACCESS = "check the path, and that you may read it"
 _NO_LINKS = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -66,7 +67,10 @@ def check_json(kind: type[Model], value: object, file: Path, *keys: str, hint: s
         return kind.model_validate_json(json.dumps(value))  # strict models accept a list for a tuple only in JSON
     except ValidationError as error:
         if error.errors()[0]["type"] == "json_invalid":
-            path, message = _find_half_character(value), "the text has half of a surrogate pair, which is no character"
+            path, message = (
+                _find_half_character(value),
+                "the text has half of a surrogate pair, which is not a character",
+            )
         else:
             problem = next(messages.problems(error, kind, value, messages.dotted))
             path, message = problem.path, problem.message
@@ -94,7 +98,7 @@ def read_errors(file: Path) -> Iterator[None]:
     except FileNotFoundError:
         raise
     except OSError as error:
-        raise CheckpointError(f"{file} cannot be read: {error.strerror or error}") from None
+        raise CheckpointError(f"{file} cannot be read: {error.strerror or error}", hint=_CHECK_ACCESS) from None
 
 
 def read_file(file: Path, limit: int, *, size: int | None = None, missing: str | None = None) -> bytes:
@@ -115,7 +119,7 @@ def read_file(file: Path, limit: int, *, size: int | None = None, missing: str |
             if size is not None and found != size:
                 raise manifest_error(file, f"its size is {found} bytes, but the manifest has {size}")
             if found > limit:
-                raise CheckpointError(f"{file} is too large: {found:,} bytes, at most {limit:,} are read")
+                raise CheckpointError(f"{file} is too large: {found:,} bytes; at most {limit:,} are read")
             return opened.read(found)
     except FileNotFoundError:
         if missing is None:
@@ -159,7 +163,7 @@ def _opened(file: Path) -> Iterator[tuple[BinaryIO, int]]:
         status = os.fstat(handle)
         if not stat.S_ISREG(status.st_mode):
             os.close(handle)
-            raise CheckpointError(f"{file} is not a regular file: it is a folder, a pipe or a device")
+            raise CheckpointError(f"{file} is not a regular file; put a regular file in its place")
         with os.fdopen(handle, "rb") as opened:
             yield opened, status.st_size
     except (FileNotFoundError, NotADirectoryError) as error:
@@ -168,7 +172,7 @@ def _opened(file: Path) -> Iterator[tuple[BinaryIO, int]]:
         reason = getattr(error, "strerror", None) or str(error) or "there is not enough memory"
         if getattr(error, "errno", None) in _NOT_A_FILE:
             reason = "it is not a regular file"
-        raise CheckpointError(f"{file} cannot be read: {reason}") from None
+        raise CheckpointError(f"{file} cannot be read: {reason}", hint=_CHECK_ACCESS) from None
 
 
 def parse_json(data: bytes | str, file: Path) -> dict[str, Any]:
@@ -243,7 +247,7 @@ def require_plain_entries(folder: Path, *, only_links: bool = False) -> None:
         links = [entry.name for entry in entries if entry.is_symlink()]
         special = [entry.name for entry in entries if not (entry.is_file() or entry.is_dir())]
     except OSError as error:
-        raise CheckpointError(f"{folder} cannot be read: {error.strerror}") from None
+        raise CheckpointError(f"{folder} cannot be read: {error.strerror}", hint=_CHECK_ACCESS) from None
     if links:
         raise CheckpointError(f"{folder / links[0]} is a link; replace it by the file itself")
     if special and not only_links:
@@ -270,7 +274,7 @@ def _refuse_constant(name: str) -> NoReturn:
 def _finite_float(text: str) -> float:
     value = float(text)
     if not math.isfinite(value):
-        raise _StrictError(f"the number {text[:20]} is too large; allowed are numbers up to 1.8e308")
+        raise _StrictError(f"the number {text[:20]} is too large; the largest number allowed is 1.8e308")
     return value
 
 

@@ -1,8 +1,8 @@
-"""Remember which tasks the user trusts, so that a downloaded run or recording cannot name code that is then run.
+"""Store which tasks the user trusts, so that rlcli does not execute code only because a downloaded run names it.
 
 Installed tasks are always trusted. A run may also name a task folder or a configuration in Python. The author of the
-run chose that code, so it is loaded only after the user has named it on a command line of this machine. The user's
-state folder has one file for each such task.
+run chose that code, so rlcli loads the code only after the user has given its path on a command line of this machine.
+The user's state folder has one file for each such task.
 """
 
 import contextlib
@@ -21,7 +21,7 @@ _MAX_BYTES = 16 * 1024
 
 
 def named_task(name: str) -> TaskSource:
-    """Find a task that the user names on a command line, and trust its code in runs from now on.
+    """Find a task that the user gives on a command line, and trust its code in runs from now on.
 
     Raises:
         TaskError: if there is no such task.
@@ -33,7 +33,7 @@ def named_task(name: str) -> TaskSource:
 
 
 def is_known(record: Mapping[str, Any]) -> bool:
-    """Return whether the user has named this task on a command line before, so that its code is trusted.
+    """Return whether the user has given this task on a command line before, so that its code is trusted.
 
     Args:
         record: the task's record (`TaskSource.record`), with its folder or its configuration in Python.

@@ -44,7 +44,7 @@ def read_member(file: Path, name: str) -> bytes:
     """Return the content of the member `name` of a zip file. All members of the file are checked first.
 
     Raises:
-        CheckpointError: if the file is no zip, is too large, has unsafe members, or lacks the member.
+        CheckpointError: if the file is not a zip, is too large, has unsafe members, or lacks the member.
     """
     data = read_archive_file(file)
     if data[:1] == b"\x80":
@@ -125,8 +125,7 @@ def read_tensors(data: bytes, where: str) -> Mapping[str, Any]:
     if data[:4] != b"PK\x03\x04":
         kind = "a plain pickle or a file of torch before 1.6" if data[:1] == b"\x80" else "not a torch file"
         raise CheckpointError(
-            f"{where} is {kind}, which rlcli does not open; accepted is a .pt file of torch 1.6 or newer with only"
-            " tensors",
+            f"{where} is {kind}, which rlcli does not open; give a .pt file of torch 1.6 or newer with only tensors",
             hint=pickle_check.SAVE_HINT,
         )
     archive = _archive(data, where)

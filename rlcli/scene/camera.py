@@ -65,7 +65,7 @@ class CameraSensor(LazySensor):
     def image(self) -> Tensor:
         """Images, the top row first: rgb (num_envs, h, w, 3) uint8, other data (num_envs, h, w, 1) float32.
 
-        Depth and distance are in meters; 0 means that nothing is within `clip`. Segmentation has the ids of the visible
+        Depth and distance are in metres; 0 means that nothing is within `clip`. Segmentation has the ids of the visible
         bodies, 0 for the world's own geoms, and -1 where nothing is visible. Where a pixel is the mean of several
         samples, samples without a hit count as 0 m.
         """

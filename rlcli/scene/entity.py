@@ -93,7 +93,7 @@ class Entity:
             patterns: names or regular expressions.
 
         Raises:
-            NameProblem: if a pattern matches no element or is no regular expression, or an element is matched twice.
+            NameProblem: if a pattern matches no element or is not a regular expression, or an element is matched twice.
         """
         names = self.names[alias]
         singular = {"Bodies": "body"}.get(alias, alias[:-1].lower())

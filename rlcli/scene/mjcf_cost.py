@@ -42,9 +42,9 @@ class ModelCost:
     """Cost of a model, in ordinary elements; 0 by default."""
 
     size: float = 0.0
-    """Cost of the model's elements, with those that it attaches."""
+    """Cost of the model's elements, including the elements of attached models."""
     loads: float = 0.0
-    """Cost of the models that MuJoCo reads to attach them, each before it is copied."""
+    """Cost of reading the models that are attached; their copies are counted in `size`."""
     elements: float = 0.0
     """Number of elements."""
     referring: float = 0.0
@@ -71,7 +71,7 @@ class ModelCost:
         return ModelCost(stored=stored, **sums)
 
     def loading(self, other: ModelCost) -> ModelCost:
-        """Return the cost of this model if it also reads the model `other`, to attach it."""
+        """Return the cost of this model with the cost of reading the model `other`, which it attaches."""
         return replace(self, loads=min(self.loads + other.size + other.loads, ENDLESS))
 
     def times(self, copies: float, *, with_loads: bool = True) -> ModelCost:
@@ -178,7 +178,7 @@ def element_cost(name: str, attributes: dict[str, str]) -> float:
 
 
 def mjcf_number(text: str) -> float:
-    """Return the number in an attribute of an MJCF; NaN for text that is no number."""
+    """Return the number in an attribute of an MJCF; NaN for text that is not a number."""
     try:
         return float(text)
     except ValueError:

@@ -147,7 +147,7 @@ class MjcfScan:
         """
         if self.limited and cost > MAX_COST:
             raise BadModel(
-                f"{self.main}: the model is too large: its cost is {cost:,.0f}, at most {MAX_COST:,} is allowed (one"
+                f"{self.main}: the model is too large: its cost is {cost:,.0f}; at most {MAX_COST:,} is allowed (one"
                 f" element costs 1); the most expensive part is {self.costliest}; make this part smaller"
             )
 

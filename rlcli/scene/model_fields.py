@@ -1,6 +1,6 @@
 """Read and set fields of MjModel, such as body_mass, whose values may differ between environments.
 
-Events for domain randomization and stress tests set these fields.
+Events for domain randomisation and stress tests set these fields.
 """
 
 from __future__ import annotations

@@ -54,7 +54,7 @@ def match(patterns: str | Sequence[str], names: Sequence[str], what: str) -> lis
         what: the kind of element, for messages: joint, body, ...
 
     Raises:
-        NameProblem: if a pattern matches no name or is no regular expression, or if a name is matched twice.
+        NameProblem: if a pattern matches no name or is not a regular expression, or if a name is matched twice.
     """
     positions: list[int] = []
     for pattern in [patterns] if isinstance(patterns, str) else patterns:
@@ -76,7 +76,7 @@ def match_values(values: Mapping[str, Value], names: Sequence[str], what: str) -
         what: the kind of element, for messages: joint, body, ...
 
     Raises:
-        NameProblem: if a key matches no name or is no regular expression, or if two keys match the same name.
+        NameProblem: if a key matches no name or is not a regular expression, or if two keys match the same name.
     """
     found: list[Value | None] = [None] * len(names)
     owner: dict[int, str] = {}
@@ -95,7 +95,7 @@ def search(pattern: str, names: Sequence[str], what: str) -> list[int]:
     """Return the indices of the names that a regular expression matches completely.
 
     Raises:
-        NameProblem: if the text is no regular expression, or one that may take longer than a second.
+        NameProblem: if the text is not a regular expression, or one that may take longer than a second.
     """
     _require_cheap(pattern, max(map(len, names), default=0))
     try:

@@ -293,13 +293,11 @@ def _patch_problems(patch: schema.PatchConfig, edge: float, resolution: float) -
             )
     fine = "set a smaller resolution, or boxes: true"
     if isinstance(patch, schema.StairsPatchConfig) and not patch.boxes and patch.step_width < 2 * resolution:
-        yield (
-            "step_width",
-            f"a step of {patch.step_width:g} m needs a resolution of half that, not {resolution:g} m",
-            fine,
-        )
+        needed = f"a resolution of at most {patch.step_width / 2:g} m"
+        yield "step_width", f"a step of {patch.step_width:g} m needs {needed}, found {resolution:g} m", fine
     if isinstance(patch, schema.GridPatchConfig) and not patch.boxes and patch.cell < 2 * resolution:
-        yield "cell", f"a cell of {patch.cell:g} m needs a resolution of half that, not {resolution:g} m", fine
+        needed = f"a resolution of at most {patch.cell / 2:g} m"
+        yield "cell", f"a cell of {patch.cell:g} m needs {needed}, found {resolution:g} m", fine
     if isinstance(patch, schema.ObstaclesPatchConfig | schema.StonesPatchConfig):
         if patch.width[1] > edge:
             message = f"a width of {patch.width[1]:g} m does not fit in a patch of {edge:g} m"

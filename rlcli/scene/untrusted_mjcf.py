@@ -41,7 +41,7 @@ _WALL_TIME_S = 6 * TIME_S
 _MAX_ITERATIONS = 100_000
 _MAX_GRAVITY = 10_000
 _compiled: set[tuple[object, ...]] = set()
-"""Scenes that a subprocess has compiled without an error, as their files with versions; they need no second check."""
+"""Files and their versions of scenes that a subprocess has compiled without an error, and need no second check."""
 MUJOCO_ERRORS = (ValueError, RuntimeError, MemoryError, mujoco.FatalError, mujoco.UnexpectedError)
 """Exceptions that MuJoCo raises for a model that it cannot read or compile."""
 
@@ -111,7 +111,7 @@ class ModelsTogether:
         if self.cost.total > MAX_COST:
             raise BadModel(
                 f"{model.file}: the first {len(self._models)} models of the scene are too large together: the estimated"
-                f" cost of their compilation is {self.cost.total:,.0f}, at most {MAX_COST:,} is allowed (an ordinary"
+                f" cost of their compilation is {self.cost.total:,.0f}; at most {MAX_COST:,} is allowed (an ordinary"
                 " element costs 1, a mesh or image more); use fewer entities or smaller meshes"
             )
 

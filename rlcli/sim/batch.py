@@ -100,7 +100,7 @@ class BatchEngine(BatchWorlds):
         """Do nothing: a CPU has no streams."""
 
     def field(self, name: str) -> Tensor:
-        """Return a live view of an MjData field, (num_envs, ...); later steps compute a derived field (xpos, ...).
+        """Return a live view of an MjData field, which each later step updates. (num_envs, ...)
 
         Raises:
             ValueError: if MjData has no such field.

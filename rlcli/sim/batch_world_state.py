@@ -1,6 +1,6 @@
 """Base class of the CPU engine that holds its worlds (one for each environment) and their states.
 
-For domain randomization, the class also gives each world its own values of model fields.
+For domain randomisation, the class also gives each world its own values of model fields.
 """
 
 from __future__ import annotations

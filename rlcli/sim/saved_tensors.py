@@ -69,7 +69,7 @@ def require_in_range(value: Tensor, low: int, high: int, what: str) -> None:
     """
     if value.numel() and not bool(((value >= low) & (value <= high)).all()):
         found = f"{int(value.min())} to {int(value.max())}"
-        raise ValueError(f"the saved '{what}' has values {found}; allowed are {low} to {high}: the file is damaged")
+        raise ValueError(f"the saved '{what}' has values {found}, but must be {low} to {high}: the file is damaged")
 
 
 def _text(value: Tensor) -> str:

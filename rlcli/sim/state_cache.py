@@ -105,7 +105,7 @@ class SimData:
     def out_of_bounds(self, limit: float) -> Tensor | None:
         """Return whether each world has a position or velocity that is not finite or beyond `limit`, (num_envs,) bool.
 
-        Return None if no world has one.
+        Return None if no world has such a value.
         """
         # the sum of all squares is an upper bound of each, and not finite if one is not; 0.5 covers its rounding
         if self._squares() <= 0.5 * limit * limit:

@@ -1,6 +1,6 @@
 """Base class of the GPU engine that holds its worlds (one for each environment) and their states.
 
-For domain randomization, the class also gives each world its own values of model fields.
+For domain randomisation, the class also gives each world its own values of model fields.
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ class WarpWorlds:
             mjw.set_const(self._model, self._data)
 
     def field(self, name: str) -> Tensor:
-        """Return a live view of an MjData field, (num_envs, ...); later steps compute a derived field (xpos, ...).
+        """Return a live view of an MjData field, which each later step updates. (num_envs, ...)
 
         Raises:
             ValueError: if MuJoCo Warp's data has no such field with a row for each world.

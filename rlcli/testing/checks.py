@@ -24,7 +24,7 @@ Check = Callable[[TaskUnderTest], Iterable[Finding]]
 OnCheck = Callable[[str, "list[Finding] | None"], None]
 """Function that receives the name of each check and its findings; None: the check did not run."""
 OnNote = Callable[[str, str], None]
-"""Function that receives the name of a check and a text that is no finding, such as a measured speed."""
+"""Function that receives the name of a check and a text that is not a finding, such as a measured speed."""
 
 _steps, _episodes, _equivalence = step_checks, episode_checks, same_result_checks
 _IN_ORDER: tuple[Check, ...] = (

@@ -44,7 +44,7 @@ def task_error_text(error: Exception) -> str:
     """Return the type and the message of an error that a task raised in a check, as one line for a finding.
 
     Raises:
-        MachineError: if the error is due to too little memory, which is no defect of the task.
+        MachineError: if the error is due to too little memory, which is not a defect of the task.
     """
     if too_little := memory_error(error):
         raise too_little from error

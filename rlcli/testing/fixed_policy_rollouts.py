@@ -1,4 +1,4 @@
-"""Fixed policies (zero, random, bang-bang, sine) and their recorded rollouts, from which the linter judges a task.
+"""Fixed policies (zero, random, bang-bang, sine) and their recorded rollouts, on which the lint rules run.
 
 Fixed policies need no training, so the linter can run before any training.
 """

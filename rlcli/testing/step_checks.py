@@ -26,13 +26,13 @@ def finite(subject: TaskUnderTest) -> Iterator[Finding]:
     try:
         recording = subject.recording()
     except DivergedError as error:
-        yield error_at(subject.source.label, f"{error.message}; allowed are finite numbers", hint)
+        yield error_at(subject.source.label, f"{error.message}; all values must be finite", hint)
         return
     for number, step in enumerate(recording.steps):
         rows = step.terminated | step.truncated
         for group, values in (step.final_obs or {}).items():
             if not bool(values[rows].isfinite().all()):
-                message = f"the final observation is not finite at step {number}; allowed are finite numbers"
+                message = f"the final observation is not finite at step {number}; all values must be finite"
                 yield error_at(f"observations.{group}", message, hint)
                 return
 

@@ -164,7 +164,7 @@ class Health:
 
 
 def probe(trainer: Trainer) -> dict[str, float]:
-    """Return the metrics `Health/*`; empty with fewer than 2 observations, or if `trainer` is no `BaseTrainer`."""
+    """Return the metrics `Health/*`; empty with fewer than 2 observations, or without a `BaseTrainer`."""
     if not isinstance(trainer, BaseTrainer) or len(trainer.recent_obs) < 2:
         return {}
     found, begin, obs = {}, 0, trainer.recent_obs

@@ -60,7 +60,7 @@ def read_sb3(
         file: file that `model.save` has written; only its member `policy.pth` is read.
         activation: activation of the hidden layers, which the file does not contain; None: the library's default.
         action_bound: bound of the actions in the training, which were within +-action_bound.
-        normalizer: safetensors file with `mean` and `var` of VecNormalize; None: observations were not normalised.
+        normalizer: safetensors file with `mean` and `var` of `VecNormalize`; None: observations were not normalised.
 
     Raises:
         CheckpointError: if the file has another format, contains anything but tensors, or another kind of policy.
@@ -124,7 +124,7 @@ def read_rsl_rl(file: Path, *, activation: str | None = None, action_bound: floa
             stats = _named_tensors(saved["obs_norm_state_dict"], where)
         std = {"std": "std", "log_std": "log_std"}
     if not any(name.startswith(hidden) for name in weights):
-        raise CheckpointError(f"{file} must have an actor of RSL-RL; {_some_names(weights)}")
+        raise CheckpointError(f"{file} has no actor of RSL-RL; {_some_names(weights)}")
     layers = _layers(weights, hidden, file)
     spec, actor = _mlp_policy("gaussian-mlp", layers, activation or "elu", action_bound, file)
     actor["log_std"] = _log_std(weights, std, file)
@@ -292,7 +292,9 @@ def _lstm(weights: Mapping[str, Tensor], prefix: str, file: Path) -> tuple[dict[
     for name, value in tensors_with_prefix(weights, prefix).items():
         kind, _, layer = name.rpartition("_l")
         if kind not in ("weight_ih", "weight_hh", "bias_ih", "bias_hh") or not (layer.isdecimal() and len(layer) < 3):
-            raise CheckpointError(f"{file}: {prefix}{name[:60]} is no weight of an LSTM; other RNNs cannot be imported")
+            raise CheckpointError(
+                f"{file}: {prefix}{name[:60]} is not a weight of an LSTM; other RNNs cannot be imported"
+            )
         lstm[f"memory.layers.{layer}.{kind}"] = value
     cells: list[int] = []
     while (recurrent := lstm.get(f"memory.layers.{len(cells)}.weight_hh")) is not None:
@@ -323,7 +325,7 @@ def _normalizer(mean: Tensor, var: Tensor, stats: Mapping[str, Tensor]) -> dict[
 
 
 def _vec_normalize(file: Path) -> dict[str, Tensor]:
-    """Read the normaliser of SB3's VecNormalize from a safetensors file."""
+    """Read the normaliser of SB3's `VecNormalize` from a safetensors file."""
     data = read_archive_file(file)
     if data[:1] == b"\x80" or file.suffix == ".pkl":
         message = f"{file} is a pickle, which rlcli does not open; --normalizer takes a .safetensors file"

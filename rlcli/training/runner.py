@@ -61,7 +61,7 @@ def run_training(
         job: run and settings of the training; the run is unlocked at the end.
         trainer: the trainer, in the state in which training starts.
         env: the trainer's environment; it is closed at the end.
-        stop: stores whether a signal has asked the training to stop.
+        stop: stores whether a signal has requested a stop.
         view: display of the progress.
 
     Returns:

@@ -283,7 +283,7 @@ class Trackio(_LibraryRun):
             GRADIO_ANALYTICS_ENABLED="False",
         )
         if not any(os.environ.get(name) for name in ("TRACKIO_SPACE_ID", "TRACKIO_SERVER_URL")):
-            _set_default_variables(HF_HUB_OFFLINE="1")  # otherwise trackio asks the Hugging Face hub who owns the key
+            _set_default_variables(HF_HUB_OFFLINE="1")  # else trackio requests the key's owner from the hub
         trackio = importlib.import_module("trackio")
         self.id = resume_id or run.folder.name
         self._run = trackio.init(

@@ -70,7 +70,7 @@ class TrainingProcess:
 
     @property
     def has_failed(self) -> bool:
-        """Whether the process has ended with an error; a requested stop is no error."""
+        """Whether the process has ended with an error; a requested stop is not an error."""
         return self.exit_code != 0 and not (self.stop_requested and self.exit_code == STOPPED)
 
     def error(self) -> RlcliError:
@@ -131,7 +131,7 @@ def train_all(
         device: device of the trainings.
         jobs: largest number of processes at a time.
         options: further options of each `rlcli train` command.
-        stop: stores whether a signal has asked this process to stop.
+        stop: stores whether a signal has requested a stop.
         poll: called every `POLL_S` seconds while processes run.
 
     Returns:

@@ -313,7 +313,7 @@ class Bench:
         self._compare(best)
 
     def _sizes(self, setting: Setting) -> Iterator[Setting]:
-        """Yield the setting with half the environments and twice the steps of a rollout, and with twice and half.
+        """Yield two settings: half the environments and twice the steps of a rollout, and the opposite.
 
         The number of samples in an iteration stays equal. Nothing is yielded for an agent without such a setting.
         """

@@ -140,7 +140,7 @@ def compare(
         seeds: the seeds of the trainings.
         until: the threshold, such as `success=0.99`; None: `success=0.99`.
         episodes: number of episodes of an evaluation.
-        stop: stores whether a signal has asked to stop; signals are handled while the trainings run.
+        stop: stores whether a signal has requested a stop; signals are handled while the trainings run.
 
     Raises:
         CheckpointError: if no trial has finished.

@@ -46,7 +46,8 @@ def open_study(folder: Path, settings: Mapping[str, Any], storage: str | None, *
 
     Args:
         folder: the folder of the sweep, which contains the journal file.
-        settings: settings of the sweep: `task`, `name`, `direction` (maximize or minimize), `pruner` (median or none).
+        settings: settings of the sweep: `task`, `name`, `direction` (`maximize` or `minimize`), `pruner` (`median` or
+            `none`).
         storage: URL of a database; None: the journal file in the folder.
         create: whether to create the study if it does not exist.
 
@@ -98,7 +99,7 @@ def storage_errors(storage: str | None) -> Iterator[None]:
 
 
 def without_password(url: str) -> str:
-    """Return a URL without its password, which stands before the `@` or in the query (`?password=`)."""
+    """Return a URL without its password, which is before the `@` or in the query (`?password=`)."""
     url = re.sub(r"([?&][^=&]*(?:password|passwd|pwd|secret|token)[^=&]*)=[^&]*", r"\1=", url, flags=re.IGNORECASE)
     before, at, after = url.rpartition("@")
     if not at:

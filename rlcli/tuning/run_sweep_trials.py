@@ -126,7 +126,7 @@ class TrialRunner:
         request: the request for the trainings.
         objective: the metric that ranks the trials, and the limit of their training.
         jobs: number of trials at a time.
-        stop: stores whether a signal has asked to stop.
+        stop: stores whether a signal has requested a stop.
     """
 
     def __init__(
@@ -227,7 +227,7 @@ class TrialRunner:
     def _end(self, stage: _Stage, stopping: bool) -> None:
         """Handle the end of a process: after a training, start the evaluation; else store the trial's result or error.
 
-        `stopping` says whether a signal has stopped the process; the trial can then be resumed.
+        `stopping` is whether a signal has stopped the process; the trial can then be resumed.
 
         Raises:
             RlcliError: for an error that does not depend on the trial, such as a full disk.

@@ -142,7 +142,7 @@ class Sweep:
         return [trial for trial in self.trials() if trial.state.name == "COMPLETE"]
 
     def best(self) -> FrozenTrial | None:
-        """Return the finished trial with the best objective, of equal ones the first; None if no trial is finished."""
+        """Return the finished trial with the best objective (the first of equal ones); None if no trial is finished."""
         done = self._finished()
         if not done:
             return None
@@ -223,7 +223,7 @@ class Sweep:
         trial.release()
 
     def write_preset(self, data: Callable[[Mapping[str, Any]], Mapping[str, Any]]) -> Path | None:
-        """Write a `--config` file with the settings of the best trial; return the file, or None without finished trial.
+        """Write a `--config` file with the settings of the best trial; return the file, None if no trial is finished.
 
         Args:
             data: returns the content of the file for a trial's values (key -> value).
@@ -300,7 +300,7 @@ def open_sweep(
     Args:
         folder: the folder of the sweep; created if it does not exist.
         settings: entries of `_SweepSettings`; except for `trials`, they must equal those of the existing sweep.
-        source: entries of `RecordedTask`, which say where the task is; they must equal those of the existing sweep.
+        source: entries of `RecordedTask`, with the place of the task; they must equal those of the existing sweep.
         parameters: the keys of the task or agent that the sweep varies, with their ranges.
         storage: URL of a database for the trials; None: the file `JOURNAL` in the folder.
 

@@ -39,7 +39,7 @@ class StudyView(AbstractContextManager[Any], Protocol):
     """
 
     def poll(self) -> None:
-        """Update the display, unless the last update was just before."""
+        """Update the display, unless it was updated a moment ago."""
 
 
 @dataclass(slots=True)
@@ -106,7 +106,7 @@ def train_seeds(
         folder: folder of the study.
         device: device of the trainings; None: the device of the study.
         jobs: number of trainings at a time.
-        stop: stores whether a signal has asked to stop; signals are handled while the trainings run.
+        stop: stores whether a signal has requested a stop; signals are handled while the trainings run.
         make_view: returns the display of the progress, for a title and the folders of the runs.
         finished_too: whether finished runs are continued too, because they have a new budget.
         options: further options of each `rlcli train --resume`, see `resume_options`.

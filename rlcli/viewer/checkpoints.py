@@ -29,7 +29,7 @@ class RunCheckpoints:
     seed: int = 0
 
     def steps(self) -> list[int]:
-        """Return the existing checkpoints, each by its number of environment steps, ascending; empty without folder."""
+        """Return the environment steps of the existing checkpoints, ascending; an empty list without a folder."""
         try:
             return steps(self.run.checkpoints)
         except OSError:

@@ -67,7 +67,7 @@ class Renderer(contextlib.AbstractContextManager["Renderer"]):
         return self._pixels()
 
     def draw(self, model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.uint8]:
-        """Return an RGB image of a model and its state, without markers; `mj_forward` was called. (height, width, 3)"""
+        """Return an RGB image of a model and its state, after `mj_forward`, without markers. (height, width, 3)"""
         self._compose(model, data, (0.0, 0.0, 0.0))
         return self._pixels()
 

@@ -18,7 +18,7 @@ _log = logging.getLogger(__name__)
 
 
 class VideoAborted(Exception):
-    """Exception that ends the recording of a video because a signal has asked the training to stop."""
+    """Exception that ends the recording of a video because a signal has requested a stop."""
 
 
 class TrainingVideos(StepObserver):
@@ -31,7 +31,7 @@ class TrainingVideos(StepObserver):
         make_env: builds a single environment; called before the first video.
         folder: folder of the videos, which are named `STEP.mp4` after the number of environment steps.
         interval: number of iterations between videos.
-        stopping: returns whether a signal has asked the training to stop.
+        stopping: returns whether a signal has requested a stop.
     """
 
     def __init__(
@@ -79,7 +79,7 @@ class TrainingVideos(StepObserver):
         """End the recording if the training is being stopped; called before each step of the filmed environment.
 
         Raises:
-            VideoAborted: if a signal has asked the training to stop.
+            VideoAborted: if a signal has requested a stop.
         """
         if self._stopping():
             raise VideoAborted

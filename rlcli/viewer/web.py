@@ -110,7 +110,7 @@ class _ViewerThread:
         return self._thread.is_alive()
 
     def raise_error(self) -> None:
-        """Check that no error has ended the viewer's thread, except for an `RlcliError`.
+        """Raise an error if MuJoCo's viewer has ended the thread with an error other than an `RlcliError`.
 
         Raises:
             DependencyError: if MuJoCo's viewer has raised an error.

@@ -310,7 +310,7 @@ def test_file_that_differs_from_policy_is_deleted(newest, tmp_path, monkeypatch,
 
     monkeypatch.setattr(module.formats, "write", wrong)
     file = tmp_path / "deep" / f"policy{module.FORMATS[format_]}"
-    with pytest.raises(VerdictError, match=r"outputs 'action' with the relative difference 0\.001"):
+    with pytest.raises(VerdictError, match=r"output 'action' differs from that of the policy by 0\.001 \(relative\)"):
         export(open_checkpoint(newest("cartpole")), file, format_)
     assert list(tmp_path.iterdir()) == []
 

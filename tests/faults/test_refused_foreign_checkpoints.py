@@ -292,7 +292,7 @@ def test_repeated_tensor_does_not_fill_the_memory(monkeypatch):
 @pytest.mark.parametrize(
     ("weights", "output"),
     [
-        ({}, "must have an actor"),
+        ({}, "has no actor of RSL-RL"),
         ({"actor.0.weight": torch.zeros(1, 4)}, "use linear layers with a bias"),
         ({"actor.0.weight": torch.zeros(1, 4), "actor.0.bias": torch.zeros(3)}, "use linear layers with a bias"),
         ({"actor.0.weight": torch.zeros(1, 4), "actor.0.bias": torch.zeros(1)}, "depends on the state"),
@@ -406,13 +406,22 @@ COSTLY = {
     "shared lists": (b"]" + b"".join(b"q%c]h%cah%ca" % (i, i, i) for i in range(60)) + b".", "as often as it is"),
     "nested tuples as a key": (b"}N" + b"\x85" * 1_000_000 + b"Ns.", "deeper than 100 levels"),
     "nested lists": (b"]" * 200 + b"a" * 199 + b".", "deeper than 100 levels"),
-    "a list put into lists before they are filled": (b"]q\x00]q\x01h\x00ah\x00h\x01a.", "part of another"),
-    "a list in itself": (b"]q\x00h\x00a.", "part of another"),
+    "a list put into lists before they are filled": (b"]q\x00]q\x01h\x00ah\x00h\x01a.", "part of another value"),
+    "a list in itself": (b"]q\x00h\x00a.", "part of another value"),
     "a tuple as a key": (b"}N\x85Ns.", "neither text nor a whole number"),
     "a large number as a key": (b"}\x8a\x08" + b"\xff" * 7 + b"\x1fNs.", "neither text nor a whole number"),
-    "keys of an OrderedDict's arguments": (b"ccollections\nOrderedDict\n]]N\x85aNaa\x85R.", "calls something"),
-    "a storage of a wanted size": (STORAGE + b"\x8a\x05\x00\x00\x00\x00\x7f\x85R.", "calls something"),
-    "a storage with tuples as its name": (b"(X\x07\x00\x00\x00storage" + STORAGE + b"N\x85\x85NNtQ.", "else than text"),
+    "keys of an OrderedDict's arguments": (
+        b"ccollections\nOrderedDict\n]]N\x85aNaa\x85R.",
+        "calls a function that does not create",
+    ),
+    "a storage of a wanted size": (
+        STORAGE + b"\x8a\x05\x00\x00\x00\x00\x7f\x85R.",
+        "calls a function that does not create",
+    ),
+    "a storage with tuples as its name": (
+        b"(X\x07\x00\x00\x00storage" + STORAGE + b"N\x85\x85NNtQ.",
+        "a name that is not text",
+    ),
     "attributes from a list": (b"ccollections\nOrderedDict\n)R]b.", "sets attributes"),
 }
 """Pickle of plain values that takes very long or much memory to load, or crashes Python -> part of the error."""

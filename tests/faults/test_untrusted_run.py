@@ -312,7 +312,9 @@ def test_task_plays_where_it_was_trained_or_has_been_named(own, cli, monkeypatch
 
 def test_naming_an_installed_task_trusts_no_folder_of_that_name(at, cli):
     hostile_runs.CODE["a folder"](at)
-    refused(cli("play", "cartpole", "--checkpoint", at.run, "--viewer", "none"), (5,), "you have not used")
+    refused(
+        cli("play", "cartpole", "--checkpoint", at.run, "--viewer", "none"), (5,), "has not been used on this machine"
+    )
     assert not at.canary.exists()
 
 
@@ -341,4 +343,4 @@ def test_read_only_state_folder_is_not_an_error(own, cli, monkeypatch, tmp_path)
     (tmp_path / "file").touch()
     monkeypatch.setenv("RLCLI_STATE_DIR", str(tmp_path / "file"))
     assert cli("train", "./mine").code == 0
-    refused(cli("play", "--checkpoint", "latest", "--viewer", "none"), (5,), "have not used")
+    refused(cli("play", "--checkpoint", "latest", "--viewer", "none"), (5,), "has not been used")

@@ -224,7 +224,7 @@ def test_state_dict_restores_curriculum(tmp_path):
         ("rewards.alife.weight", "'rewards' has no setting 'alife' that may change"),
         ("reward.alive.weight", "did you mean 'rewards'"),
         ("rewards.alive.func", "'rewards.alive' has no setting 'func' that may change"),
-        ("rewards.alive", "which is no number and no list of numbers"),
+        ("rewards.alive", "which is neither a number nor a list of numbers"),
         ("rewards.alive.weight.0", "the setting has no element '0'"),
         ("sim.dt", "the task has no setting 'sim' that may change"),
         ("terminations.time_out.time_out", "has no setting 'time_out' that may change"),

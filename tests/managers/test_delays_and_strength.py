@@ -65,7 +65,7 @@ def test_delayed_actions_are_restored():
 @pytest.mark.parametrize(
     ("delay", "message"),
     [
-        ("{seconds: 0.02}", "no multiple of the control period of 0.0166667 s; give 0.0166667 or 0.0333333"),
+        ("{seconds: 0.02}", "not a multiple of the control period of 0.0166667 s; give 0.0166667 or 0.0333333"),
         ("{seconds: [0.1, 0.05]}", "the delay is 0.1 to 0.05 s"),
         ("{}", "a delay has either steps or seconds: give one of the two"),
         ("{steps: 1, seconds: 1.0}", "a delay has either steps or seconds: give one of the two"),

@@ -224,7 +224,7 @@ def test_bad_value_of_a_later_step_is_named(tmp_path, section, value):
 def test_terms_may_return_numbers_of_any_type(tmp_path, section, kind):
     value = f"torch.ones({{}}, dtype=torch.{kind})"
     if section == "terminations" and "float" in kind:
-        with pytest.raises(ConfigError, match=f"type torch.{kind}; return a tensor of shape .3,. of truth values"):
+        with pytest.raises(ConfigError, match=f"type torch.{kind}; return a tensor of shape .3,. of booleans"):
             with_value(tmp_path, section, value, value, 0)
     elif section != "success" or kind != "bool":
         obs = with_value(tmp_path, section, value, value, 8)

@@ -259,4 +259,4 @@ def test_ten_thousand_entry_points_are_refused(group, command, plugins, cli):
     done = cli(*command)
     assert done.returncode == (4 if group == "tasks" else 0), done.stderr
     (broken,) = unreadable_distributions()
-    assert f"10000 entry points in rlcli.{group}, at most" in broken.reason
+    assert f"10000 entry points in rlcli.{group}; at most" in broken.reason

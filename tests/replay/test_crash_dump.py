@@ -200,6 +200,6 @@ def test_truncated_or_changed_dump_is_refused(dump):
 def test_deeply_nested_header_is_refused(tmp_path):
     file = tmp_path / "deep.safetensors"
     safetensors.torch.save_file({"x": torch.zeros(1)}, file, metadata={"rlcli": "[" * 1_000_000})
-    with pytest.raises(CheckpointError, match="no valid recording, crash dump or failure case") as caught:
+    with pytest.raises(CheckpointError, match="not a valid recording, crash dump or failure case") as caught:
         read_trajectory(file)
     assert "--record FILE makes a recording" in caught.value.hint

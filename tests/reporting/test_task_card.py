@@ -38,10 +38,10 @@ def test_observation_table_has_meaning_unit_size_elements():
     terms = rows(built("cartpole", layout="task.layout.json"), "Observations: policy")
     assert terms["joint_vel_rel"] == {
         "Term": "joint_vel_rel",
-        "What": "Joint velocities minus their defaults [m/s or rad/s].",
+        "Meaning": "Joint velocities minus their defaults [m/s or rad/s].",
         "Unit": "m/s or rad/s",
         "Size": "2",
-        "Of": "slider_to_cart, cart_to_pole",
+        "Elements": "slider_to_cart, cart_to_pole",
     }
 
 
@@ -122,11 +122,11 @@ def test_empty_tables_and_columns_are_left_out():
 def test_direct_task_card_has_parameters_and_docstrings():
     content = built("cartpole-direct", "params.max_effort=250", layout="direct.layout.json")
     assert rows(content, "Parameters")["max_effort"] == {
-        "Parameter": "max_effort", "Value": "250", "What": "Force on the cart at action 1 [N].", "Default": "400",
+        "Parameter": "max_effort", "Value": "250", "Meaning": "Force on the cart at action 1 [N].", "Default": "400",
     }  # fmt: skip
     words = rows(content, "Docstrings of the task")
     reward = "Reward an upright pole and slow joints; a failure costs 2."
-    assert words["Reward"]["What"] == reward
+    assert words["Reward"]["Meaning"] == reward
     assert words["Start of an episode"]["Hook"] == "reset_idx"
     assert rows(content, "Observations: policy")["pole_vel"]["Unit"] == "rad/s"
     assert dict(content.facts)["Observations are clipped to"] == "±5"
@@ -147,7 +147,7 @@ def test_inherited_hooks_have_docstrings(tmp_path):
         "        reset_dist: float = 1.0\n        max_effort: float = 1.0\n        pole_vel_weight: float = 1.0\n"
     )
     words = rows(built(tmp_path), "Docstrings of the task")
-    assert {row["Hook"]: row["What"] for row in words.values()} == {
+    assert {row["Hook"]: row["Meaning"] for row in words.values()} == {
         "Task": "Balance.", "reset": "From below.", "is_done": "Never."}  # fmt: skip
 
 

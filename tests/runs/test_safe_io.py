@@ -22,7 +22,7 @@ def file(tmp_path):
 def test_read_file_refuses_one_byte_above_the_limit(file):
     assert read_file(file, 8) == b'{"a": 1}'
     assert read_file(file, 100, size=8) == b'{"a": 1}'
-    with pytest.raises(CheckpointError, match=r"data\.json is too large: 8 bytes, at most 7 are read"):
+    with pytest.raises(CheckpointError, match=r"data\.json is too large: 8 bytes; at most 7 are read"):
         read_file(file, 7)
 
 
@@ -96,7 +96,7 @@ def test_read_file_refuses_an_invalid_name(tmp_path):
 def test_json_limit_is_4_mib(tmp_path):
     manifest = tmp_path / "manifest.json"
     manifest.write_bytes(b" " * (4 * 1024 * 1024 + 1))
-    with pytest.raises(CheckpointError, match=r"is too large: 4,194,305 bytes, at most 4,194,304 are read"):
+    with pytest.raises(CheckpointError, match=r"is too large: 4,194,305 bytes; at most 4,194,304 are read"):
         open_checkpoint(tmp_path)
     manifest.write_bytes(b" " * 4 * 1024 * 1024)
     with pytest.raises(CheckpointError, match="not JSON"):

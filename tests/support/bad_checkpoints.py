@@ -58,7 +58,7 @@ FILES = (
 
 @dataclass(frozen=True)
 class Case:
-    """A damage, the commands that refuse it, and the run: `ppo` with normalization, or `sac` with a buffer."""
+    """A damage, the commands that refuse it, and the run: `ppo` with normalisation, or `sac` with a buffer."""
 
     name: str
     damage: Callable[[Path], None]

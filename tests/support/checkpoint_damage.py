@@ -215,7 +215,7 @@ def every(make):
 
 
 def written(slot, value):
-    """Return a change that stores an attribute of the task with a value that is no tensor."""
+    """Return a change that stores an attribute of the task with a value that is not a tensor."""
 
     def change(values):
         data = json.dumps({slot: json.dumps(value)}).encode()

@@ -67,7 +67,7 @@ SHORT = ("--num-envs", "32", "--max-iterations", "4", "--logger", "none", "-q")
 
 @pytest.fixture(scope="session")
 def runs(tmp_path_factory) -> Path:
-    """Return a runs folder with short runs: PPO and SAC of each cartpole, one normalized SAC, and the arm."""
+    """Return a runs folder with short runs: PPO and SAC of each cartpole, one normalised SAC, and the arm."""
     folder = tmp_path_factory.mktemp("trained")
     arm = folder / "arm"
     arm.mkdir()

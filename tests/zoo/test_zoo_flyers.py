@@ -1,4 +1,4 @@
-"""Hooks of flight and locomotion tasks on a GPU: no host synchronization, and fixed buffers."""
+"""Hooks of flight and locomotion tasks on a GPU: no host synchronisation, and fixed buffers."""
 
 from types import SimpleNamespace
 

@@ -1,4 +1,4 @@
-"""Replacement of the package `isaaclab` for tasks that rlcli runs: configuration classes, environments and terms.
+"""Replacement for the package `isaaclab` for tasks that rlcli runs: configuration classes, environments and terms.
 
 Every name can be imported from here, and from a submodule with the same name as in Isaac Lab:
 `from rlcli_isaaclab import configclass` or `from rlcli_isaaclab.utils import configclass`.

@@ -62,9 +62,9 @@ class JointDrive:
         if self._undriven and bool(self.target[:, self._undriven].any()):
             wrong = self.target[:, self._undriven].any(dim=0).nonzero()[:, 0].tolist()
             raise TaskError(
-                f"the task sets {self._kind} targets of joints of '{self._name}' that have no such actuator:"
+                f"the task sets {self._kind} targets of joints of '{self._name}' that have no {self._kind} actuator:"
                 f" {listing(self._joints[self._undriven[i]] for i in wrong)}",
-                hint="add actuators of this kind to the MJCF",
+                hint=f"add {self._kind} actuators to the MJCF",
             )
         if not self._knows_actions and isinstance(self._env, ManagedEnv) and hasattr(self._env, "action_manager"):
             self._leave_out_driven(self._env)

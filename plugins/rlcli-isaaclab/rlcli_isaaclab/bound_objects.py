@@ -107,7 +107,7 @@ class BoundCommand(BoundObject):
         self._counted = self.term.time_left.clone()
 
     def _write_time(self) -> None:
-        """Pass the times on that the user's code has written to `time_left`."""
+        """Copy times that the user's code has written to `time_left` to the command manager."""
         is_written = self.term.time_left != self._counted
         self._managed.command_manager.set_time_left(self._name, is_written, self.term.time_left)
         self._counted = self.term.time_left.clone()

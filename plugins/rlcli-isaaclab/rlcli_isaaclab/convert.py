@@ -149,7 +149,7 @@ def agent(data: Mapping[str, Any], report: Report) -> dict[str, Any]:
     }
     normalized = policy.get("actor_obs_normalization", top.get("empirical_normalization", False))
     if bool(policy.get("critic_obs_normalization", normalized)) != bool(normalized):
-        policy.note("approximated", "critic_obs_normalization", "actor and critic share one observation normalizer")
+        policy.note("approximated", "critic_obs_normalization", "actor and critic share one observation normaliser")
     config["normalize_observations"] = bool(normalized)
     _require_class(top, "OnPolicyRunner")
     _require_class(algorithm, "PPO")

@@ -98,7 +98,7 @@ class _Loader(strict_yaml.Loader):
         if items > MAX_ITEMS:
             raise _error(f"the file has more than {MAX_ITEMS} items; make it smaller", mark)
         if depth > MAX_DEPTH + 1:  # the deepest allowed value is inside MAX_DEPTH lists
-            raise _error(f"values are nested deeper than {MAX_DEPTH} levels; write them flatter", mark)
+            raise _error(f"values are nested deeper than {MAX_DEPTH} levels; use fewer levels", mark)
 
     def _check(self, event: Any) -> None:
         if isinstance(event, yaml.ScalarEvent):

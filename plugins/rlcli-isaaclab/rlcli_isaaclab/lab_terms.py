@@ -1,4 +1,4 @@
-"""Reimplementations of Isaac Lab's terms, in Isaac Lab's form, whose parameters no built-in term of rlcli has."""
+"""Terms of Isaac Lab that no built-in term of rlcli can replace, written again with Isaac Lab's arguments."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class LabTerm:
 
     function: Any
     needed: Callable[[Mapping[str, Any]], bool]
-    """Function of the term's parameters that returns whether they need `function` instead of the built-in term."""
+    """Function that receives the term's parameters, and returns whether `function` replaces the built-in term."""
 
 
 def last_action_of_term(env: Any, action_name: str) -> Tensor:

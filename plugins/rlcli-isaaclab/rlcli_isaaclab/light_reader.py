@@ -34,7 +34,7 @@ def read_light(report: Report, item: Node, spawn: Node, lights: dict[str, Any]) 
         config["direction"] = _direction_of(rotation)
     item.node("init_state").mark_mapped("pos", "rot")
     if kind in lights:
-        report.entries[item.key] = ("ignored", f"a scene has one {kind} light, and another light is used")
+        report.entries[item.key] = ("ignored", f"rlcli supports one {kind} light in a scene, and uses the first")
         return
     lights[kind] = config
 

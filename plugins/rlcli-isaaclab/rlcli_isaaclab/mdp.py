@@ -1,4 +1,4 @@
-"""Replacement of Isaac Lab's `mdp`: functions for terms, and configuration classes of actions and commands.
+"""Replacement for Isaac Lab's `mdp`: functions for terms, and configuration classes of actions and commands.
 
 In a configuration, a function stands for rlcli's built-in term, or for a copy of Isaac Lab's term in `lab_terms`. The
 user's own terms may also call the function: `mdp.joint_pos_rel(env, asset_cfg)` returns the value of the term.

@@ -96,7 +96,7 @@ def model_hint(entity: str) -> str:
 
 
 def mjcf_of(usd: str, root: Path, given: Mapping[str, str], entity: str) -> str:
-    """Return the MJCF of an entity: the one that the user gives, else `usd` if it is an `.xml` file, else a known one.
+    """Return the MJCF of an entity: the user's file, else `usd` if it is an `.xml` file, else a known model's file.
 
     Args:
         usd: path of the model in the task's files, usually of a USD file.

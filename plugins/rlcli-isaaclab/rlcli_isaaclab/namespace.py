@@ -1,4 +1,4 @@
-"""Replacement of the modules `isaaclab` and `isaacsim` that task files import.
+"""Replacement for the modules `isaaclab` and `isaacsim` that task files import.
 
 The file `names.json` lists the public names of each module of Isaac Lab; `tools/names.py` writes it. If this package
 defines a name, the task gets that object. For any other name in the list the task gets a replacement, which raises an
@@ -88,7 +88,7 @@ _SIM = {
 
 
 class LabModule(ModuleType):
-    """Replacement of a module of Isaac Lab; each of its names is looked up at its first use."""
+    """Replacement for a module of Isaac Lab; each of its names is looked up at its first use."""
 
     def __getattr__(self, name: str) -> Any:
         if name == "__all__":

@@ -1,4 +1,4 @@
-"""Translation of Isaac Lab's randomization events. Each event becomes zero, one or several events of rlcli."""
+"""Translation of Isaac Lab's randomisation events. Each event becomes zero, one or several events of rlcli."""
 
 from __future__ import annotations
 
@@ -182,7 +182,7 @@ def _gains(event: EventParameters) -> EventConfigs:
         parts["explicit"] = {"func": "randomize_pd_gains", "joints": found["explicit"], **gains, **sampling}
     if not parts:
         event.params.report.problem(
-            event.key, f"no actuator of '{event.name}' has a gain to randomize; remove the event"
+            event.key, f"no actuator of '{event.name}' has a gain to randomise; remove the event"
         )
     return parts
 

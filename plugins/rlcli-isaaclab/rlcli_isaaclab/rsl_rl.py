@@ -136,6 +136,6 @@ class RslRlOnPolicyRunnerCfg(RslRlBaseRunnerCfg):
         return data
 
     def __rlcli_fit__(self, agent: dict[str, Any], observations: Mapping[str, Any], notes: list[Note]) -> None:
-        """Assign the task's observation groups to actor and critic in `agent`, as `obs_groups` says."""
+        """Assign the task's observation groups to actor and critic in `agent`, as `obs_groups` defines."""
         if isinstance(self.obs_groups, Mapping):
             fit_groups(self.obs_groups, agent, observations, notes)

@@ -147,9 +147,9 @@ class Asset:
         known = [n for n in (*dir(type(self)), *vars(self)) if not n.startswith("_")]
         hint = did_you_mean(name, known) or f"attributes: {listing(known, 40)}"
         if "physx" in name and not did_you_mean(name, known):
-            hint = "rlcli has no PhysX; use `data` and the randomization events"
+            hint = "rlcli has no PhysX; use `data` and the randomisation events"
         if "tendon" in name or name.startswith("write_joint_"):
-            raise absence(f"Articulation.{name}", hint="use a randomization event, or set the value in the MJCF")
+            raise absence(f"Articulation.{name}", hint="use a randomisation event, or set the value in the MJCF")
         raise MissingMemberError(f"an asset has no '{name}'; {hint}", _OWN_CLASS)
 
     def find_joints(self, name_keys: Any, joint_subset: Any = None, preserve_order: bool = False) -> Any:

@@ -153,7 +153,7 @@ class SceneReader:
     def integrator(self) -> dict[str, str]:
         """Return {"integrator": "implicitfast"} if a joint has a damping gain `kv`, otherwise {}.
 
-        PhysX integrates the damping of joint drives implicitly. MuJoCo's Euler method would diverge with a large one.
+        PhysX integrates the damping of joint drives implicitly. MuJoCo's Euler method diverges with large damping.
         """
         joints = [settings for entity in self.entities.values() for settings in entity.get("joints", {}).values()]
         return {"integrator": "implicitfast"} if any(settings.get("kv") for settings in joints) else {}

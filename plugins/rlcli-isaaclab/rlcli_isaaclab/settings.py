@@ -46,7 +46,7 @@ class Report:
     def matching(self, patterns: Any, names: Sequence[str], key: Key) -> list[str]:
         """Return the joints in `names` that match one of `patterns`: names or regular expressions from a file.
 
-        A pattern that is no text, no regular expression, or takes long to compare, is recorded as a mistake.
+        A pattern that is not a text, not a regular expression, or takes long to compare, is recorded as a mistake.
         """
         from rlcli.scene.names import NameProblem, search
 

@@ -63,7 +63,7 @@ def running(setup: Setup) -> Iterator[None]:
 
 
 class Spawn:
-    """Replacement of a function of Isaac Lab that creates a prim, such as a light, from a configuration."""
+    """Replacement for a function of Isaac Lab that creates a prim, such as a light, from a configuration."""
 
     def __init__(self, name: str) -> None:
         self.__name__ = self.__qualname__ = name

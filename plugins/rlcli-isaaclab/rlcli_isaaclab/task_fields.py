@@ -28,7 +28,7 @@ def own_fields(cfg: Any, base: type) -> tuple[dict[str, Any], type[BaseModel]]:
     for name, value in vars(cfg).items():
         if name in known or name.startswith(("_", "rlcli_")):
             continue
-        if isinstance(value, type):  # a field whose value is a class is left out: its members are no settings
+        if isinstance(value, type):  # a field whose value is a class is left out: its members are not settings
             continue
         if dataclasses.is_dataclass(value) and not is_framework(type(value).__module__):
             inner, kind = own_fields(value, _Nothing)

@@ -141,7 +141,7 @@ TERMS: dict[str, dict[str, Entry]] = {
         "terrain_levels_vel": Entry("terrain_levels", fixed={"command": "base_velocity"}),
     },
 }
-"""Section -> Isaac Lab's name of a term -> counterpart. `randomization.py` translates randomization events."""
+"""Section -> Isaac Lab's name of a term -> counterpart. `randomization.py` translates randomisation events."""
 
 HEIGHT_TERMS = {
     "base_pos_z",

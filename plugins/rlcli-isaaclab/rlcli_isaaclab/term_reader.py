@@ -147,7 +147,7 @@ class TermReader(ObjectReader):
         """
         function = builtin_name(node.data.get("func"))
         if section == "events" and function in _LOOKS:
-            self.report.entries[node.key] = ("ignored", "rlcli does not randomize colours and textures")
+            self.report.entries[node.key] = ("ignored", "rlcli does not randomise colours and textures")
             return
         if section == "events" and function == "reset_root_state_uniform" and self._moves_nothing(node):
             node.mark_mapped(*node.data)

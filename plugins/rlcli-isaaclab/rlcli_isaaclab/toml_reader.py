@@ -1,4 +1,4 @@
-"""Replacement of the library `toml`, with which packages of Isaac Lab tasks read their version."""
+"""Replacement for the library `toml`, with which packages of Isaac Lab tasks read their version."""
 
 from __future__ import annotations
 

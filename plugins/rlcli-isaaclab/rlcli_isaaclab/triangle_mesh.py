@@ -1,4 +1,4 @@
-"""Replacement of the library `trimesh` if it is not installed, for tasks that sample points on surfaces."""
+"""Replacement for the library `trimesh` if it is not installed, for tasks that sample points on surfaces."""
 
 from __future__ import annotations
 

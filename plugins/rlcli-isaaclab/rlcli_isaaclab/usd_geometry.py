@@ -1,4 +1,4 @@
-"""Replacement of USD geometry, for tasks that read the shapes of objects.
+"""Replacement for USD geometry, for tasks that read the shapes of objects.
 
 Every collision geom of an entity is a prim with a triangle mesh.
 """

@@ -1,4 +1,4 @@
-"""Replacement of the USD stage, for tasks that read the poses of prims when they start."""
+"""Replacement for the USD stage, for tasks that read the poses of prims when they start."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Prim:
 
 
 class Stage:
-    """Replacement of the USD stage: its prims are the bodies of the first environment."""
+    """Replacement for the USD stage: its prims are the bodies of the first environment."""
 
     def GetPrimAtPath(self, path: Any) -> Any:  # noqa: N802
         """Return the prim of a path, whose last part is the name of an entity or of a body."""

@@ -72,7 +72,7 @@ class _BoundActuator:
         defaults = {"armature": self._field(env, "dof_armature", model), "effort_limit": model.effort_limit}
         cfg = SimpleNamespace(**term.settings)
         self._actuator: Any = term.class_type(cfg, names, ids, env.num_envs, env.device, **defaults)
-        # shared, so that events can randomize them
+        # shared, so that events can randomise them
         self._actuator.stiffness, self._actuator.damping = model.stiffness, model.damping
         self._state = AttributeState(self._actuator, ("stiffness", "damping", "cfg"))
         self._actuator.reset(self._all)

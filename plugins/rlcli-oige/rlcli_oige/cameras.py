@@ -193,7 +193,7 @@ def warp_to_torch(array: Tensor) -> Tensor:
 
 
 class Writer(Counterpart):
-    """Replacement of Replicator's PytorchWriter. It does nothing, because the listener reads the camera itself."""
+    """Replacement for Replicator's PytorchWriter. It does nothing, because the listener reads the camera itself."""
 
     def initialize(self, *args: Any, **kwargs: Any) -> None:
         """Do nothing."""
@@ -202,7 +202,7 @@ class Writer(Counterpart):
 
 
 class Listener(Counterpart):
-    """Replacement of Replicator's PytorchListener: it returns the images of a task's camera in all environments."""
+    """Replacement for Replicator's PytorchListener: it returns the images of a task's camera in all environments."""
 
     def __init__(self, env: OigeEnv) -> None:
         self._env = env

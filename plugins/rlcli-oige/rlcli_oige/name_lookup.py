@@ -31,7 +31,7 @@ def find(name: str, known: Iterable[str]) -> Any:
 
 
 def used_names(known: Iterable[str]) -> list[str]:
-    """Return the names that the importing file uses, does not define, and that another file of the task defines."""
+    """Return the names that the importing file uses but does not define, and that another file of the task defines."""
     importer = _importer()
     if importer is None:
         return []

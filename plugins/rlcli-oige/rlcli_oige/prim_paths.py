@@ -11,10 +11,10 @@ ZERO = f"{BASE}/env_0"
 
 
 def path_pattern(expression: str) -> re.Pattern[str]:
-    """Return a view's `prim_paths_expr` as a regular expression. `.*` and `*` match within one step of the path.
+    """Return a view's `prim_paths_expr` as a regular expression. `.*` and `*` match within one part of the path.
 
     Raises:
-        TaskError: if the text is no regular expression.
+        TaskError: if the text is not a regular expression.
     """
     steps = str(expression).rstrip("/").split("/")
     steps = ["[^/]*" if step == "*" else step.replace(".*", "[^/]*") for step in steps]

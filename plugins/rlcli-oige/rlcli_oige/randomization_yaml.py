@@ -248,7 +248,7 @@ def _check_numbers(at: Path, entry: Mapping[str, Any], problem: Callable[[Path, 
 def _entries(block: Mapping[str, Any]) -> Iterator[tuple[tuple[str, ...], Any]]:
     """Yield each randomisation of a `domain_randomization:` mapping that is not checked yet: its path, and its value.
 
-    The last step of the path is the trigger (`on_startup`, `on_reset` or `on_interval`), or a wrong key in its place.
+    The last part of the path is the trigger (`on_startup`, `on_reset` or `on_interval`), or a wrong key in its place.
     """
     params = block.get("randomization_params")
     for key, content in params.items() if isinstance(params, dict) else ():

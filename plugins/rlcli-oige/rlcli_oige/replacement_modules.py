@@ -82,7 +82,7 @@ def find_numpy(name: str, file: str = "") -> ModuleType | None:
 def find_hydra(name: str, file: str = "") -> ModuleType | None:
     """Return the replacement of `hydra` for a file of OmniIsaacGymEnvs: the use of its names raises an error.
 
-    The same for `omegaconf` if it is not installed; None in all other cases.
+    Return a replacement of `omegaconf` too, if it is not installed. Return None in all other cases.
     """
     own = file and "omniisaacgymenvs" in Path(file).read_text(encoding="utf-8", errors="replace")
     return find(name) if own and (name != "omegaconf" or importlib.util.find_spec(name) is None) else None
@@ -110,7 +110,7 @@ def _line_without_counterpart(file: Path) -> int:
 
 
 class _Module(ModuleType):
-    """Replacement of a module of Omniverse or USD."""
+    """Replacement for a module of Omniverse or USD."""
 
     def __getattr__(self, name: str) -> Any:
         vocabulary = importlib.import_module("rlcli_oige.vocabulary")

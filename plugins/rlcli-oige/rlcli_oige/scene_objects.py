@@ -197,7 +197,7 @@ class FixedCylinder(_Cylinder):
 
 
 class Cloner(Counterpart):
-    """Replacement of Isaac Sim's Cloner: it copies prims inside an environment. rlcli copies the environments."""
+    """Replacement for Isaac Sim's Cloner: it copies prims inside an environment. rlcli copies the environments."""
 
     def __init__(self, spacing: float = 0.0, *args: Any, **kwargs: Any) -> None:
         self.spacing = spacing
@@ -236,7 +236,7 @@ class Cloner(Counterpart):
 
 
 class GridCloner(Cloner):
-    """Replacement of Isaac Sim's GridCloner; rlcli itself places the environments on a grid."""
+    """Replacement for Isaac Sim's GridCloner; rlcli itself places the environments on a grid."""
 
 
 class GroundPlane:

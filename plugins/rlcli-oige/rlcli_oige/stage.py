@@ -283,7 +283,7 @@ class Stage(Counterpart):
         self._rename_elements(prim, where)
 
     def clone(self, source: Prim, path: str, pos: Any, quat: Any) -> None:
-        """Add a copy of a prim with its model and settings; a path that exists only gets the pose."""
+        """Add a copy of a prim with its model and settings; if the path exists, only the pose is set."""
         if path != source.prim_path:
             given = (getattr(source, name) if name in source.given else None for name in ("pos", "quat"))
             copy = self.define(path, *given)

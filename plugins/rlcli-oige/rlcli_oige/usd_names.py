@@ -58,7 +58,7 @@ class Missing(type):
 
 
 class Ignored:
-    """Replacement of a class or function of Omniverse that has no effect in MuJoCo.
+    """Replacement for a class or function of Omniverse that has no effect in MuJoCo.
 
     Calls are recorded and return the object itself; so does each of its attributes.
     """

@@ -1,4 +1,4 @@
-"""Replacement of USD's schemas: drives, limits, masses and gravity change the model, others are logged as ignored.
+"""Replacement for USD's schemas: drives, limits, masses and gravity change the model, others are logged as ignored.
 
 A schema is a class with USD's generated methods: `Apply`, `Get`, `Define`, `GetXAttr`, `CreateXAttr`, `CreateXRel`.
 """

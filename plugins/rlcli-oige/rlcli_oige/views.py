@@ -29,7 +29,7 @@ class XFormPrimView(Counterpart):
     """View of the frames or bodies that a path expression matches in each environment. Rows are ordered by environment.
 
     Args:
-        prim_paths_expr: a path whose steps may be regular expressions: `/World/envs/.*/Ant/torso`.
+        prim_paths_expr: a path whose parts may be regular expressions: `/World/envs/.*/Ant/torso`.
         name: name of the view.
     """
 
@@ -118,7 +118,7 @@ class XFormPrimView(Counterpart):
         return self._env
 
     def get_world_poses(self, indices: Any = None, clone: bool = True, usd: bool = True) -> tuple[Tensor, Tensor]:
-        """Return positions [m] with the environment's grid position, and orientations (w, x, y, z). (n, 3), (n, 4)"""
+        """Return positions [m], relative to the grid's origin, and orientations (w, x, y, z). (n, 3), (n, 4)"""
         position, quat = self.get_local_poses(indices)
         return position + select_rows(self._origins, self._index(indices)), quat
 

@@ -182,7 +182,7 @@ def test_duplicate_view_name_and_missing_object_are_refused(env):
     assert not registry.object_exists("box_view")
 
 
-# --- randomization of each attribute ---
+# --- randomisation of each attribute ---
 
 READ = {
     "stiffness": lambda env: env.task._arms.get_gains()[0][:, 1],

@@ -1,4 +1,4 @@
-"""Common mistakes in a task's YAML, its randomization and its folder."""
+"""Common mistakes in a task's YAML, its randomisation and its folder."""
 
 import pytest
 import yaml as yaml_module

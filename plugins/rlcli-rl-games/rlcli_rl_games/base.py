@@ -28,7 +28,7 @@ from rlcli_rl_games.vec_env import RlGamesVecEnv
 ACTIVATIONS = {"swish": "silu"}
 """Name of an activation in rl_games -> its name in a saved policy, where they differ."""
 OBSERVATION_CLIP = 5.0
-"""rl_games clips normalized observations to +-this value."""
+"""rl_games clips normalised observations to +-this value."""
 _EPSILON = 1e-5
 """rl_games adds this number to the variance of observations."""
 _LEARNER_HINT = "lower the learning rate or grad_norm in params.config; the last good checkpoint is kept"
@@ -96,11 +96,11 @@ class RlGamesTrainer(BaseTrainer):
 
     @abstractmethod
     def _optimizers(self) -> dict[str, torch.optim.Optimizer]:
-        """Return the optimizers, by name."""
+        """Return the optimisers, by name."""
 
     @abstractmethod
     def load_weights(self, policy: Mapping[str, Tensor]) -> None:
-        """Load a policy's weights, with its normalizer; the weights of the critics do not change."""
+        """Load a policy's weights, with its normaliser; the weights of the critics do not change."""
 
     def start(self) -> None:
         """Reset the environment to its first episodes."""
@@ -209,7 +209,7 @@ class RlGamesTrainer(BaseTrainer):
     def _error(self, key: str, message: str, hint: str) -> ConfigError:
         return agent_error(self.env, ("params", "config", key), message, hint)
 
-    # --- the observation normalizer: a saved policy adds 1e-8 to the variance instead of rl_games' epsilon ---
+    # --- the observation normaliser: a saved policy adds 1e-8 to the variance instead of rl_games' epsilon ---
 
     def _normalizer_tensors(self) -> dict[str, Tensor]:
         if not self.spec.normalize:

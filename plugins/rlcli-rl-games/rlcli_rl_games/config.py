@@ -17,7 +17,7 @@ Fraction = Annotated[float, Field(ge=0, le=1)]
 Activation = Literal["elu", "relu", "tanh", "swish"]
 """Activations of rl_games that a saved policy supports as well; swish is SiLU."""
 Initializer = dict[str, str | int | float]
-"""`{name: default}`, or another initializer of rl_games with its parameters."""
+"""`{name: default}`, or another initialiser of rl_games with its parameters."""
 Nothing = Literal["None"] | None
 _DEFAULT: Initializer = {"name": "default"}
 _ZERO: Initializer = {"name": "const_initializer", "val": 0}
@@ -67,26 +67,26 @@ class MlpConfig(StrictModel):
     activation: Activation
     """Activation after each hidden layer."""
     initializer: Initializer = _DEFAULT
-    """How the weights are initialized: `{name: default}`, or another initializer of rl_games with its parameters."""
+    """How the weights are initialised: `{name: default}`, or another initialiser of rl_games with its parameters."""
     regularizer: dict[str, Any] | None = None
     """Ignored, as in rl_games."""
     d2rl: Literal[False] = False
-    """Whether every hidden layer also receives the input (a D2RL network): not supported."""
+    """Whether every hidden layer also receives the input (a D2RL network); must be false."""
 
 
 class ContinuousConfig(StrictModel):
     """Settings of the normal distribution from which actions are sampled."""
 
     mu_activation: Nothing = None
-    """Activation on the mean: only null."""
+    """Activation on the mean; must be null."""
     sigma_activation: Nothing = None
-    """Activation on the logarithm of the standard deviation: only null."""
+    """Activation on the logarithm of the standard deviation; must be null."""
     mu_init: Initializer = _DEFAULT
-    """Initializer of the layer that computes the mean."""
+    """Initialiser of the layer that computes the mean."""
     sigma_init: Initializer = _ZERO
-    """Initializer of the logarithm of the standard deviation, such as `{name: const_initializer, val: 0}`."""
+    """Initialiser of the logarithm of the standard deviation, such as `{name: const_initializer, val: 0}`."""
     fixed_sigma: Literal[True] = True
-    """Whether the standard deviation is trained but does not depend on the observation: only true."""
+    """Whether the standard deviation is trained but does not depend on the observation; must be true."""
 
 
 class SpaceConfig(StrictModel):
@@ -115,7 +115,7 @@ class SacNetworkConfig(StrictModel):
     name: Literal["soft_actor_critic"] = "soft_actor_critic"
     """Name of the network in rl_games."""
     separate: Literal[True] = True
-    """Whether actor and critics have separate networks: only true."""
+    """Whether actor and critics have separate networks; must be true."""
     space: dict[str, Any] | None = None
     """Ignored, as in rl_games."""
     mlp: MlpConfig
@@ -138,7 +138,7 @@ class RewardShaper(StrictModel):
 
 
 class CentralValueConfig(_Settings):
-    """Settings of a critic with its own network and optimizer, which observes the group `critic`."""
+    """Settings of a critic with its own network and optimiser, which observes the group `critic`."""
 
     network: CentralNetworkConfig
     """Network of the critic."""
@@ -151,15 +151,15 @@ class CentralValueConfig(_Settings):
     minibatch_size: Count
     """Samples per minibatch."""
     clip_value: bool
-    """Whether the loss is the larger error of the value and of the value clipped to its old prediction +- e_clip."""
+    """Whether the loss is the larger of two errors: of the value, and of the value clipped to the old one +- e_clip."""
     normalize_input: bool
-    """Whether this critic's observations are normalized by running mean and standard deviation."""
+    """Whether this critic's observations are normalised by running mean and standard deviation."""
     truncate_grads: bool = False
     """Whether the norm of the gradient is clipped to grad_norm."""
     grad_norm: Positive = 1.0
     """Maximum norm of the gradient, with truncate_grads."""
     e_clip: Positive = 0.2
-    """Largest change of the value from its old prediction, with clip_value."""
+    """Largest change of the value from the old value, with clip_value."""
     kl_threshold: Positive | None = None
     """Ignored, as in rl_games."""
     weight_decay: NotNegative = 0.0
@@ -172,7 +172,7 @@ class CentralNetworkConfig(StrictModel):
     name: Literal["actor_critic"] = "actor_critic"
     """Name of the network in rl_games."""
     central_value: Literal[True] = True
-    """Whether the network only has a value output, no actions: only true."""
+    """Whether the network has a value output and no actions; must be true."""
     mlp: MlpConfig
     """The hidden layers of the critic."""
 
@@ -181,21 +181,21 @@ class PpoSettings(_Settings):
     """Settings of PPO: the mapping `params.config`."""
 
     normalize_input: bool
-    """Whether observations are normalized by running mean and standard deviation."""
+    """Whether observations are normalised by running mean and standard deviation."""
     normalize_value: bool = False
-    """Whether the critic is trained on returns that are normalized by running mean and standard deviation."""
+    """Whether the critic is trained on returns that are normalised by running mean and standard deviation."""
     normalize_advantage: bool
-    """Whether advantages are normalized over the rollout."""
+    """Whether advantages are normalised over the rollout."""
     value_bootstrap: bool = True
     """Whether a time-out is bootstrapped; `bootstrap` sets how."""
     reward_shaper: RewardShaper = RewardShaper()
     """Scale, shift and limits of the reward."""
     mixed_precision: Literal[False] = False
-    """Whether updates use mixed precision; only False is allowed."""
+    """Whether updates use mixed precision; must be false."""
     gamma: Fraction
     """Discount factor."""
     tau: Fraction
-    """Lambda of generalized advantage estimation."""
+    """Lambda of generalised advantage estimation."""
     learning_rate: Positive
     """Learning rate of Adam."""
     lr_schedule: Literal["adaptive", "linear", "constant", "identity", "None"] | None = None
@@ -211,9 +211,9 @@ class PpoSettings(_Settings):
     entropy_coef: NotNegative
     """Weight of the entropy bonus."""
     e_clip: Positive
-    """Largest deviation of the probability ratio from 1, and with clip_value of the value from its old prediction."""
+    """Largest deviation of the probability ratio from 1; with clip_value, also of the value from the old value."""
     clip_value: bool
-    """Whether the value loss is the larger error of the value and of the value clipped to the old one +- e_clip."""
+    """Whether the loss is the larger of two errors: of the value, and of the value clipped to the old one +- e_clip."""
     clip_actions: bool = True
     """Whether actions are clipped to +-1."""
     horizon_length: Count
@@ -249,13 +249,13 @@ class SacSettings(_Settings):
     """Settings of SAC: the mapping `params.config`."""
 
     normalize_input: bool = False
-    """Whether observations are normalized by running mean and standard deviation."""
+    """Whether observations are normalised by running mean and standard deviation."""
     value_bootstrap: bool = True
     """Whether a time-out is bootstrapped; `bootstrap` sets how."""
     reward_shaper: RewardShaper = RewardShaper()
     """Scale, shift and limits of the reward."""
     mixed_precision: Literal[False] = False
-    """Whether updates use mixed precision; only False is allowed."""
+    """Whether updates use mixed precision; must be false."""
     gamma: Fraction = 0.99
     """Discount factor."""
     num_steps_per_episode: Count = 1
@@ -374,7 +374,7 @@ class RlGamesConfig(AgentConfig):
 
 
 class PpoConfig(RlGamesConfig):
-    """Proximal policy optimization (rl_games' `a2c_continuous`)."""
+    """Proximal policy optimisation (rl_games' `a2c_continuous`)."""
 
     algorithm: Literal["ppo"] = "ppo"
     """Algorithm: ppo."""

@@ -36,7 +36,7 @@ __all__ = [
 
 
 class NullWriter:
-    """Replacement of rl_games' writer of TensorBoard files, since rlcli logs the metrics."""
+    """Replacement for rl_games' writer of TensorBoard files, since rlcli logs the metrics."""
 
     def add_scalar(self, *_: Any, **__: Any) -> None:
         """Do nothing."""

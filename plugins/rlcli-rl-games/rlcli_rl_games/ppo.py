@@ -105,7 +105,7 @@ class PpoTrainer(RlGamesTrainer):
             self.agent.central_value_net.update_lr(self.agent.central_value_net.lr)
 
     def load_weights(self, policy: Mapping[str, Tensor]) -> None:
-        """Load a policy's weights, with its normalizer; the critic's weights do not change.
+        """Load a policy's weights, with its normaliser; the critic's weights do not change.
 
         If actor and critic share a network, only the critic's output layer does not change.
         """

@@ -107,7 +107,7 @@ class SacTrainer(RlGamesTrainer):
         super().load(state)
 
     def load_weights(self, policy: Mapping[str, Tensor]) -> None:
-        """Load a policy's weights, with its normalizer; the weights of the critics do not change."""
+        """Load a policy's weights, with its normaliser; the weights of the critics do not change."""
         actor, last = self.agent.model.sac_network.actor, 2 * len(self.spec.hidden)
         weights = {}
         for name in actor.state_dict():

@@ -32,7 +32,7 @@ class PolicyConfig(StrictModel):
     noise_std_type: Literal["scalar", "log"] = "scalar"
     """Trained parameter: the standard deviation (scalar), or its logarithm (log)."""
     state_dependent_std: Literal[False] = False
-    """Whether the standard deviation depends on the state; only false is supported."""
+    """Whether the standard deviation depends on the state; must be false."""
     actor_obs_normalization: bool | None = None
     """Normalise the actor's observations by running mean and standard deviation; null: use empirical_normalization."""
     critic_obs_normalization: bool | None = None
@@ -167,7 +167,7 @@ class AlgorithmConfig(StrictModel):
     gamma: Fraction = 0.99
     """Discount factor."""
     lam: Fraction = 0.95
-    """Lambda of generalized advantage estimation."""
+    """Lambda of generalised advantage estimation."""
     entropy_coef: NotNegative = 0.01
     """Weight of the entropy bonus."""
     value_loss_coef: NotNegative = 1.0
@@ -260,7 +260,7 @@ class RunnerConfig(AgentConfig):
             clip = data.pop("clip_actions")
             if data.get("action_bound", clip) != clip:
                 bound = data["action_bound"]
-                raise ValueError(f"clip_actions ({clip}) and action_bound ({bound}) name one setting: remove one")
+                raise ValueError(f"clip_actions ({clip}) and action_bound ({bound}) set the same value: remove one")
             data["action_bound"] = clip
         return _tuples(data)
 

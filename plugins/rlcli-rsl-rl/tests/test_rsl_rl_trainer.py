@@ -296,7 +296,7 @@ def test_ignored_settings_are_reported_once(caplog):
         (["agent.actor={hidden_dims: [4]}"], "agents.rsl-rl", "older form"),
         (["agent.algorithm.desired_kl=null"], "agents.rsl-rl", "desired_kl"),
         (["agent.algorithm.class_name=Distillation"], "algorithm", "teacher"),
-        (["agent.clip_actions=1.0", "agent.action_bound=2.0"], "agents.rsl-rl", "name one setting"),
+        (["agent.clip_actions=1.0", "agent.action_bound=2.0"], "agents.rsl-rl", "set the same value"),
     ],
 )
 def test_invalid_settings_are_refused_without_heavy_imports(overrides, place, words):

@@ -58,7 +58,7 @@ def sb3(
 
     Options:
         file: File written by model.save of Stable-Baselines3.
-        normalizer: Safetensors file with `mean` and `var` of VecNormalize, the observation normalisation.
+        normalizer: Safetensors file with `mean` and `var` of `VecNormalize`, the observation normalisation.
 
     Examples:
         rlcli import sb3 model.zip --task cartpole

@@ -127,7 +127,7 @@ def work_line(running: Sequence[Work]) -> str:
     if share > 0.0:
         counts.append(f"{share:.0%}")
     if share >= _MIN_SHARE or (share > 0.0 and elapsed >= _MIN_ELAPSED_S):
-        # the estimate dates from the end of the last part, minus the time since; below 0 it was wrong and is not shown
+        # the time since the end of the last part is subtracted from its estimate; a negative result is not shown
         left = elapsed * (1.0 - share) / share - (now - changed)
         if left >= 0.0:
             return f"{title}{', '.join(counts)}, {duration_text(left)} left"

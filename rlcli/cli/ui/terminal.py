@@ -28,7 +28,7 @@ def supports_styles(stream: TextIO | None) -> bool:
 
 
 def color_mode() -> str:
-    """Return when to print colors: never, always or auto (only on a terminal).
+    """Return when to print colours: never, always or auto (only on a terminal).
 
     The environment variable NO_COLOR comes first, then FORCE_COLOR, then the user's settings.
     """

@@ -125,7 +125,9 @@ class ActuatorConfig(StrictModel):
         if self.kind == "dc_motor" and not all(curve):
             raise ValueError("kind dc_motor needs saturation_effort and velocity_limit: set both")
         if self.kind == "pd" and any(curve):
-            raise ValueError("saturation_effort and velocity_limit are allowed only with kind: dc_motor")
+            raise ValueError(
+                "saturation_effort and velocity_limit are allowed only with kind: dc_motor; set it, or remove them"
+            )
         return self
 
 

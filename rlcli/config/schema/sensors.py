@@ -138,7 +138,7 @@ class CameraSensorConfig(StrictModel):
             raise ValueError("segmentation gives ids of bodies, which have no mean over samples: remove samples")
         if self.clip[0] >= self.clip[1]:
             raise ValueError(
-                f"clip must be [near, far] in meters; near, {self.clip[0]:g}, is not below far, {self.clip[1]:g}"
+                f"clip must be [near, far] in metres; near, {self.clip[0]:g}, is not below far, {self.clip[1]:g}"
             )
         if self.eye == self.lookat:
             raise ValueError("eye and lookat are the same point, so the camera has no direction: move one of them")

@@ -237,7 +237,7 @@ class DelayConfig(StrictModel):
             if abs(value / step_dt - round(value / step_dt)) > 1e-3:
                 lower = math.floor(value / step_dt) * step_dt
                 near = f"{lower:g} or {lower + step_dt:g}"
-                raise ValueError(f"{value:g} s is no multiple of the control period of {step_dt:g} s; give {near}")
+                raise ValueError(f"{value:g} s is not a multiple of the control period of {step_dt:g} s; give {near}")
         if low > high or high / step_dt > 1000:
             allowed = f"give [low, high] in seconds, with low <= high <= {1000 * step_dt:g}"
             raise ValueError(f"the delay is {low:g} to {high:g} s; {allowed}")
@@ -308,7 +308,7 @@ class CurriculumConfig(TermConfig):
 class SuccessConfig(TermConfig):
     """A condition of success. An episode succeeds if it times out, and each condition held during its last `hold_s` s.
 
-    A term that returns a number needs `at_most` or `at_least`; a term that returns a truth value takes neither.
+    A term that returns a number needs `at_most` or `at_least`; a term that returns a boolean takes neither.
     """
 
     at_most: Number | None = None

@@ -88,7 +88,7 @@ class ShardedEngine:
 
     @property
     def warnings(self) -> dict[str, int]:
-        """Number of MuJoCo's warnings that are no divergence, by name."""
+        """Number of MuJoCo's warnings that are not a divergence, by name."""
         return sums(self._shards.call_all(attrgetter("engine.warnings")))
 
     @property

@@ -23,7 +23,7 @@ def position_command_error(env: ManagedEnv, *, entity: Entity = "robot", bodies:
 def position_command_error_tanh(
     env: ManagedEnv, *, entity: Entity = "robot", bodies: Bodies, command: Command, std: float
 ) -> Tensor:
-    """1 - tanh(distance / std), the distance from a body to the goal of a pose command; std [m]. (num_envs,)"""
+    """1 - tanh(d / std), where d is the distance from a body to the goal of a pose command [m]. (num_envs,)"""
     return _near(distance_to_goal(entity, bodies, command), std)
 
 
@@ -35,12 +35,12 @@ def orientation_command_error(env: ManagedEnv, *, entity: Entity = "robot", bodi
 def orientation_command_error_tanh(
     env: ManagedEnv, *, entity: Entity = "robot", bodies: Bodies, command: Command, std: float
 ) -> Tensor:
-    """1 - tanh(angle / std), the angle between a body's orientation and the goal's; std [rad]. (num_envs,)"""
+    """1 - tanh(angle / std), with the angle between a body's orientation and the goal's [rad]. (num_envs,)"""
     return _near(orientation_command_error(env, entity=entity, bodies=bodies, command=command), std)
 
 
 def goal_distance_tanh(env: ManagedEnv, *, command: Command, std: float) -> Tensor:
-    """1 - tanh(distance / std), the distance from the root to the goal of its own pose command; std [m]. (num_envs,)
+    """1 - tanh(d / std), where d is the distance from the root to the goal of its own pose command [m]. (num_envs,)
 
     Isaac Lab: `position_command_error_tanh` of its navigation task.
     """
@@ -72,7 +72,7 @@ def object_is_lifted(
 def object_ee_distance(
     env: ManagedEnv, *, entity: Entity = "robot", sites: Sites, object: Entity = "object", std: float
 ) -> Tensor:
-    """1 - tanh(distance / std), the distance from a site of `entity` to an object; std [m]. (num_envs,)"""
+    """1 - tanh(d / std), where d is the distance from a site of `entity` to an object [m]. (num_envs,)"""
     return _near(_distance_to_object(entity, sites, object), std)
 
 
@@ -88,7 +88,7 @@ def grasp_object(
 ) -> Tensor:
     """Sum of (open_joint_pos - position) of the finger `joints`, where a site is near an object [m]. (num_envs,)
 
-    Near: within `threshold` [m]; elsewhere 0.
+    Near means within `threshold` [m]; elsewhere the value is 0.
     """
     closed: Tensor = (open_joint_pos - entity.data.joint_pos_of(joints)).sum(dim=1)
     return closed * (_distance_to_object(entity, sites, object) <= threshold)
@@ -105,7 +105,7 @@ def object_goal_distance(
     sites: Sites | None = None,
     held_within: float | None = None,
 ) -> Tensor:
-    """1 - tanh(distance / std), the distance from an object to the goal of a pose command; std [m]. (num_envs,)
+    """1 - tanh(d / std), where d is the distance from an object to the goal of a pose command [m]. (num_envs,)
 
     0 where `object_is_lifted`, with the same parameters, is 0.
     """
@@ -173,7 +173,7 @@ class AlignEeHandle(HandleTerm):
 class GraspHandle(HandleTerm):
     """Sum of (open_joint_pos - position) of the finger `joints`, where a site is near a handle [m]. (num_envs,)
 
-    Near: within `threshold` [m]; elsewhere 0.
+    Near means within `threshold` [m]; elsewhere the value is 0.
     """
 
     joints: Joints

@@ -1,6 +1,6 @@
 """Compute the gradients of MLPs in the worker processes that step the environments and are idle between rollouts.
 
-Python runs one thread at a time, so that more than about eight threads of one process slow each other down. A minibatch
+Python runs one thread at a time, so more than about eight threads of one process slow each other down. A minibatch
 is split and summed as in `rlcli.rl.mlp_gradients.MlpGradients`, so the gradients have the same bits as with threads.
 """
 

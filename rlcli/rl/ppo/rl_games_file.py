@@ -166,7 +166,7 @@ class RlGamesReader:
             elif key == "d2rl":
                 self.note((*at, key), "ignored", "d2rl is off, and rlcli has no d2rl networks")
             elif key == "regularizer":
-                self.note((*at, key), "ignored", "rlcli has no weight regularizer")
+                self.note((*at, key), "ignored", "rlcli has no weight regulariser")
             else:
                 self._report_unknown_key((*at, key))
         for network in ("actor", "critic"):

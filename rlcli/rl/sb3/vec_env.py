@@ -68,16 +68,16 @@ class Sb3VecEnv(Sb3Base):
         self.env.close()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """Return the value of an attribute of the vectorized environment, once for each index."""
+        """Return the value of an attribute of the vectorised environment, once for each index."""
         value = None if attr_name == "render_mode" else getattr(self.env, attr_name)
         return [value for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: object, indices: object = None) -> None:
-        """Set an attribute of the vectorized environment; `indices` has no effect."""
+        """Set an attribute of the vectorised environment; `indices` has no effect."""
         setattr(self.env, attr_name, value)
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
-        """Call a method of the vectorized environment once; return its result once for each index."""
+        """Call a method of the vectorised environment once; return its result once for each index."""
         value = getattr(self.env, method_name)(*args, **kwargs)
         return [value for _ in self._get_indices(indices)]
 

@@ -158,7 +158,7 @@ def test_untrusted_task_code_is_not_run(trained, cli, monkeypatch, tmp_path):
     shown = cli("autopsy", trained, "0")
     assert shown.code == 0
     assert "contacts cannot be shown: " in shown.err
-    assert "code that you have not used on this machine" in shown.err
+    assert "has not been used on this machine before" in shown.err
     assert "REWARD PER STEP" in shown.out
     assert cli("autopsy", trained).code == 0
     assert cli("autopsy", trained, "0", "--video", "x.gif").code == 5

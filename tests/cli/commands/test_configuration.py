@@ -66,7 +66,7 @@ def column(env, *, entity: Entity = "robot"):
 def test_wrong_shape_of_term_is_reported_once(in_process, small, old, new, place):
     task = small((old, new), terms=COLUMN)
     message = "'column' returned a tensor of shape (4, 2); return a tensor of shape (4,)"
-    message += " of truth values" if "terminations" in place else ""
+    message += " of booleans" if "terminations" in place else ""
     for command in (["play", task, "--policy", "zero", "--viewer", "none"], ["train", task]):
         code, _, err = in_process(*command)
         assert code == 3

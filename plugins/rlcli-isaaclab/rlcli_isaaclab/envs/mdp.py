@@ -1,4 +1,4 @@
-"""Replacement of the module `isaaclab.envs.mdp`, with the names of `rlcli_isaaclab.mdp`."""
+"""Replacement for the module `isaaclab.envs.mdp`, with the names of `rlcli_isaaclab.mdp`."""
 
 from typing import Any
 

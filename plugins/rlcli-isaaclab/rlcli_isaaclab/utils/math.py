@@ -161,7 +161,7 @@ def axis_angle_from_quat(quat: Tensor, eps: float = 1.0e-6) -> Tensor:
     quat = torch.where(quat[..., :1] < 0.0, -quat, quat)
     half = torch.atan2(quat[..., 1:].norm(p=2, dim=-1, keepdim=True), quat[..., :1])
     small = half.abs() < 0.5 * eps
-    # the sine of the angle, not the length of the axis: a quaternion that is not normalized scales the result
+    # the sine of the angle, not the length of the axis: a quaternion that is not normalised scales the result
     return quat[..., 1:] * torch.where(small, 2.0, 2.0 * half / torch.where(small, 1.0, half.sin()))
 
 
