@@ -146,10 +146,14 @@ def _plugins(groups: tuple[str, ...] = _GROUPS) -> dict[str, Entry]:
 def _libraries() -> list[Path]:
     """Return the folders of Python, of the installed packages and of rlcli.
 
-    Packages may be in several folders: of a virtual environment, of the system, of the user (`pip install --user`).
+    Packages may be in several folders: of a virtual environment, of the system, of the user (`pip install --user`), and
+    a folder of `pip install --target`, which is known by the metadata of its packages.
     """
     folders = [path for name, path in sysconfig.get_paths().items() if name.endswith(("lib", "stdlib"))]
-    folders += [path for path in sys.path if os.path.basename(path) in ("site-packages", "dist-packages")]
+    for path in sys.path:
+        named = os.path.basename(path) in ("site-packages", "dist-packages")
+        if named or (path and any(Path(path).glob("*.dist-info"))):
+            folders.append(path)
     return [*map(Path, folders), Path(rlcli.__file__).parent]
 
 

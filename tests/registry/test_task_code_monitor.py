@@ -3,6 +3,8 @@
 import subprocess
 import sys
 
+from rlcli.registry import task_code_monitor
+
 SCRIPT = """
 import gc, random, sys, threading, time, types
 from rlcli.registry.task_code_monitor import frames_of_thread
@@ -46,3 +48,18 @@ def test_frames_of_a_running_thread_are_read_without_a_crash():
     """On Python 3.11, a garbage collection inside of `f_back` made it read freed memory."""
     done = subprocess.run([sys.executable, "-P", "-c", SCRIPT], capture_output=True, text=True, timeout=300)
     assert (done.returncode, done.stdout) == (0, "watched\n"), done.stderr[-2000:]
+
+
+def test_packages_of_pip_install_target_are_no_code_of_a_task(tmp_path, monkeypatch):
+    library, task = tmp_path / "target" / "library.py", tmp_path / "project" / "own_task.py"
+    (library.parent / "library-1.0.dist-info").mkdir(parents=True)
+    task.parent.mkdir()
+    for folder in (library.parent, task.parent):
+        monkeypatch.syspath_prepend(folder)
+    for cached in (task_code_monitor._libraries, task_code_monitor.is_task_file):
+        cached.cache_clear()
+    try:
+        assert not task_code_monitor.is_task_file(str(library), "library")
+        assert task_code_monitor.is_task_file(str(task), "own_task")
+    finally:
+        task_code_monitor._libraries.cache_clear()

@@ -142,7 +142,7 @@ def test_held_open_drawer_has_bonus(env):
     for opening, bonus in [(0.005, 0.0), (0.1, 0.5), (0.25, 1.0), (0.395, 2.0)]:
         joints = reach_for(model, data, np.array([0.35 + opening, 0.0, 0.72]), at_handle(env))
         put(env, joints.tolist(), (0.04, 0.04), opening)
-        expected = 4.0 + 0.5 + 5.0 + 7.5 * 1.5 * opening + bonus
+        expected = 4.0 + 0.5 + 5.0 + 30.0 * 1.5 * opening + bonus
         assert pay(env) == pytest.approx(expected, abs=0.03), opening
 
 
@@ -158,7 +158,7 @@ def test_reward_far_from_handle(env):
     below_and_above = float(robot.body_pos_w[0, -1, 2]) < 0.72 < float(robot.body_pos_w[0, -2, 2])
     assert not below_and_above
     near = (1.0 / (1.0 + distance**2)) ** 2
-    expected = 2.0 * near + 0.5 * 0.5 * (ahead * abs(ahead) + up * abs(up)) + 7.5 * 0.3 + 0.5
+    expected = 2.0 * near + 0.5 * 0.5 * (ahead * abs(ahead) + up * abs(up)) + 30.0 * 0.3 + 0.5
     assert pay(env) == pytest.approx(expected, abs=1e-3)
     assert pay(env, action=[1.0] * 9) == pytest.approx(expected - 0.09, abs=1e-3)
 
