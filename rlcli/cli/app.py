@@ -241,7 +241,8 @@ def _run(arguments: list[str]) -> int:
     except BaseException as raised:  # the code of a task may raise any exception
         cause = raised.error if isinstance(raised, BodyError) else raised
         # a library that is being imported may replace KeyboardInterrupt by an error of its own
-        failure = stopped_by_signal() or _as_rlcli_error(cause, arguments)
+        signal_error = None if isinstance(cause, Stopped) else stopped_by_signal()
+        failure = signal_error or _as_rlcli_error(cause, arguments)
         if failure.kind == "bug" or (isinstance(cause, ImportError) and copies.lost_modules):
             is_exit = isinstance(cause, SystemExit)
             by_module = None if is_exit else change_of_module(cause) or copies.error_of_lost_modules(cause)
