@@ -162,7 +162,10 @@ class Robot:
                 return "the file sets gravity to 0, so the robot cannot walk"
             if not self._collides:
                 return "the file turns contacts with the ground off, so the robot cannot walk"
-            return "" if self.feet() else "no body besides the root touches the ground, so the robot has no feet"
+            if not self.feet():
+                return "no body besides the root touches the ground, so the robot has no feet"
+            lies = any(self.model.body_weldid[body] == _ROOT for body in self._touching(-0.01))
+            return "the trunk touches the ground in the default pose; walking needs a pose that stands" if lies else ""
         if kind == "reach":
             if self.free:
                 return "the robot's base floats"

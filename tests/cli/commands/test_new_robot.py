@@ -218,6 +218,7 @@ def test_the_reason_for_the_kind_is_printed(cli, tmp_path):
             "the file turns contacts with the ground off",
         ),
         (DOG.replace("<geom ", '<geom contype="2" '), "velocity", "4 feet"),
+        (DOG.replace("0 0 0 0 0 -0.2", "0 0 -0.03 0.2 0 -0.03"), "balance", "the trunk touches the ground"),
         (
             DOG.replace("<geom ", '<geom contype="2" conaffinity="2" '),
             "balance",
@@ -321,6 +322,11 @@ def test_gravity_that_a_flag_turns_off_can_be_set_in_the_task(cli, tmp_path):
 def test_robot_without_collisions_stands_on_the_ground_in_its_default_pose(cli, tmp_path):
     _, task = written(cli, tmp_path, DOG.replace("<geom ", '<geom contype="0" conaffinity="0" '))
     assert task["scene"]["entities"]["robot"]["pos"][2] == pytest.approx(0.2205, abs=1e-3)
+
+
+def test_the_next_command_checks_whether_the_robot_stands(cli, tmp_path):
+    result, _ = written(cli, tmp_path, DOG)
+    assert " && rlcli lint my-robot && rlcli train my-robot\n" in result.err
 
 
 def test_the_package_is_described_by_the_task_of_the_robot(cli, tmp_path):
