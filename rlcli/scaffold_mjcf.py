@@ -36,6 +36,8 @@ _MAX_DECIMATION = 20
 """Largest number of physics steps in a control period; see `Robot.tempo` for robots with a very short time step."""
 _VIEW = np.array([4.0, 4.0, 3.0])
 """Direction from the robot to the camera, world frame. (x, y, z)"""
+_NO_CONTACTS = int(mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+"""Flags of an MJCF that turn contacts off."""
 _ROOT = 1
 """Id of the robot's root in the compiled model: the first body after the world."""
 
@@ -76,6 +78,11 @@ class Robot:
         robot: one whose time step is so short that the decimation would exceed `_MAX_DECIMATION`."""
         self.gravity = float(np.linalg.norm(model.opt.gravity))
         """Magnitude of gravity in the MJCF, in the unit of length of the file per s^2."""
+        own = model.body_rootid[model.geom_bodyid] == _ROOT
+        colliding = own & ((model.geom_contype | model.geom_conaffinity) & 1 != 0)  # the ground has the bits 1 and 1
+        self._collides = bool(colliding.any() and not model.opt.disableflags & _NO_CONTACTS)
+        self._solid = np.flatnonzero(colliding if colliding.any() else own)
+        """Ids of the robot's geoms that collide with the ground; of all its geoms if none collides."""
         balls = [model.joint(j).name for j in range(model.njnt) if model.jnt_type[j] == int(mujoco.mjtJoint.mjJNT_BALL)]
         if balls:
             raise ValueError(f"ball joints are not supported: {listing(balls)}; use three hinges for each")
@@ -153,7 +160,12 @@ class Robot:
                 return "the robot's base is fixed"
             if not self.gravity:
                 return "the file sets gravity to 0, so the robot cannot walk"
-            return "" if self.feet() else "no body besides the root touches the ground, so the robot has no feet"
+            if not self._collides:
+                return "the file turns contacts with the ground off, so the robot cannot walk"
+            if not self.feet():
+                return "no body besides the root touches the ground, so the robot has no feet"
+            lies = any(self.model.body_weldid[body] == _ROOT for body in self._touching(-0.01))
+            return "the trunk touches the ground in the default pose; walking needs a pose that stands" if lies else ""
         if kind == "reach":
             if self.free:
                 return "the robot's base floats"
@@ -311,7 +323,7 @@ class Robot:
         return high
 
     def _touching(self, height: float, *, absolute: bool = False) -> list[int]:
-        """Return the ids of the robot's bodies with a colliding geom below z = 0, after the root is moved vertically.
+        """Return the ids of the robot's bodies with a geom of `_solid` below z = 0, after the root is moved vertically.
 
         Args:
             height: change of the root's z coordinate from the default pose [m].
@@ -321,11 +333,7 @@ class Robot:
         data.qpos[:] = self.data.qpos
         data.qpos[2] = height if absolute else data.qpos[2] + height
         mujoco.mj_kinematics(model, data)
-        found = []
-        for geom in range(model.ngeom):
-            solid, body = model.geom_contype[geom] or model.geom_conaffinity[geom], int(model.geom_bodyid[geom])
-            if solid and model.body_rootid[body] == _ROOT and _lowest_z(model, data, geom) < 0.0:
-                found.append(body)
+        found = [int(model.geom_bodyid[geom]) for geom in self._solid if _lowest_z(model, data, int(geom)) < 0.0]
         return list(dict.fromkeys(found))
 
     def _inertia(self, data: mujoco.MjData) -> dict[int, float]:

@@ -18,6 +18,8 @@ SCALAR = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 """Joint types with one position: hinge and slide."""
 FREE = int(mujoco.mjtJoint.mjJNT_FREE)
 """Joint type of a floating base."""
+_NO_GRAVITY = int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)
+"""Flag of an MJCF that turns gravity off."""
 
 
 def default_pose(spec: mujoco.MjSpec) -> np.ndarray | None:
@@ -40,12 +42,16 @@ def remove_scene_elements(spec: mujoco.MjSpec) -> list[str]:
     Equalities (weld, connect) with mocap bodies are removed, too: a task does not move mocap bodies, so the equalities
     would hold the robot. If as many joints are pulled by tendons as have an actuator of their own, the actuators of
     tendons and their sensors are removed. So are servos with dynamics of their own, such as a filter. The task drives
-    these joints directly. `spec` is changed in place.
+    these joints directly. If a flag turns gravity off, gravity 0 replaces the flag: the flag would override the gravity
+    of the task. `spec` is changed in place.
 
     Returns:
         Names of the joints that have lost their actuators. The list is empty if the robot has no other actuator: then
         the task drives all joints.
     """
+    if spec.option.disableflags & _NO_GRAVITY:
+        spec.option.disableflags &= ~_NO_GRAVITY
+        spec.option.gravity = [0.0, 0.0, 0.0]
     lost = [*_remove_tendon_actuators(spec), *_remove_unknown_servos(spec)]
     for key in list(spec.keys):
         spec.delete(key)

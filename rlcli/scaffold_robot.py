@@ -1,8 +1,9 @@
 """Task design for `rlcli new --robot`: read an MJCF, choose a kind of task, and return the model and the YAML data.
 
 velocity: follow velocity commands, for a robot with a floating base, feet, at least four driven joints, and fewer
-passive joints than driven ones. reach: bring the last body to goals, for a robot with a fixed base and at least two
-joints, all driven. balance: keep the default pose, for any other robot.
+passive joints than driven ones, whose MJCF has gravity and contacts with the ground. reach: bring the last body to
+goals, for a robot with a fixed base and at least two joints, all driven. balance: keep the default pose, for any other
+robot.
 """
 
 from __future__ import annotations

@@ -85,11 +85,11 @@ class _VelocityCommand(EntityTerm, TensorState):
         """
         data = self.entity.data
         actual = torch.cat([data.root_lin_vel_b[:, :2], data.root_ang_vel_b[:, 2:]], dim=1)
-        commanded = self._arrows(self.command, COMMANDED, 0.5, "commanded velocity")
-        return [*commanded, *self._arrows(actual, ACTUAL, 0.45, "actual velocity")]
+        commanded = self._arrows(self.command, COMMANDED, 0.5, "commanded")
+        return [*commanded, *self._arrows(actual, ACTUAL, 0.45, "actual")]
 
-    def _arrows(self, velocity: Tensor, color: Color, height: float, label: str) -> list[Marker]:
-        """Return the arrows of a velocity (vx, vy, wz), at a height above the root [m]."""
+    def _arrows(self, velocity: Tensor, color: Color, height: float, kind: str) -> list[Marker]:
+        """Return the arrows of a commanded or actual velocity (vx, vy, wz), at a height above the root [m]."""
         data = self.entity.data
         vx, vy, wz = velocity.unbind(1)
         zero = torch.zeros_like(vx)
@@ -100,7 +100,8 @@ class _VelocityCommand(EntityTerm, TensorState):
         above = data.root_pos_w + torch.tensor([0.0, 0.0, height], device=velocity.device)
         ahead = above + in_world(zero + _ARM, zero)
         ways = ((above, above + in_world(vx, vy)), (ahead, ahead + in_world(zero, wz * _ARM)))
-        return [Arrow(start, end, color, label=label) for start, end in ways]
+        labels = (f"{kind} velocity", f"{kind} yaw rate (arrow ahead)")
+        return [Arrow(start, end, color, label=label) for (start, end), label in zip(ways, labels, strict=True)]
 
     def tensors(self) -> dict[str, Tensor]:
         """Return the sampled velocities, and a mask of the environments in which the robot is to stand."""

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import mujoco
 import mujoco_warp as mjw
@@ -14,6 +16,8 @@ from rlcli.errors import ConfigError, DeviceError, DivergedError, Problem, one_l
 from rlcli.sim.contact_capacity import Capacity
 from rlcli.sim.skippable_work import skippable_flags
 
+_MAX_DENSE = 60
+"""Largest number of degrees of freedom for which MuJoCo Warp has dense matrices."""
 _BIT = mjw.OverflowType
 OVERFLOW_SETTINGS = {
     **dict.fromkeys((_BIT.NEFC, _BIT.NJMAX_NNZ), "constraints_per_env"),
@@ -38,7 +42,7 @@ def put_on_device(
         DeviceError: for more worlds than the device's memory holds.
     """
     try:
-        with warnings.catch_warnings(action="ignore"):
+        with warnings.catch_warnings(action="ignore"), _storage_for_warp(model):
             on_device = mjw.put_model(model)
         if not on_device.nsensorcollision:  # distance sensors need the collision pass
             on_device.opt.disableflags |= skippable_flags(model) & int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
@@ -71,7 +75,24 @@ def overflow_error(found: int, capacity: Capacity) -> DivergedError:
 
 
 def _make_data(model: mujoco.MjModel, num_envs: int, capacity: Capacity) -> mjw.Data:
-    return mjw.make_data(model, nworld=num_envs, nconmax=capacity.contacts, njmax=capacity.constraints)
+    with _storage_for_warp(model):
+        return mjw.make_data(model, nworld=num_envs, nconmax=capacity.contacts, njmax=capacity.constraints)
+
+
+@contextmanager
+def _storage_for_warp(model: mujoco.MjModel) -> Iterator[None]:
+    """Let MuJoCo Warp choose how it stores the Jacobian of a large model: it has no dense matrices for large models.
+
+    The storage does not change the physics. A model is dense because of its MJCF, or of `avoid_sparse_newton`, whose
+    bug MuJoCo Warp does not have.
+    """
+    chosen = model.opt.jacobian
+    if chosen == mujoco.mjtJacobian.mjJAC_DENSE and model.nv > _MAX_DENSE:
+        model.opt.jacobian = mujoco.mjtJacobian.mjJAC_AUTO
+    try:
+        yield
+    finally:
+        model.opt.jacobian = chosen
 
 
 def _memory_error(model: mujoco.MjModel, num_envs: int, device: torch.device, capacity: Capacity) -> DeviceError:

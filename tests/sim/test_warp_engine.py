@@ -550,3 +550,20 @@ def test_equality_constraints_use_current_velocities(constraint, how):
             engine.forward(selection_of(engine, *range(N)))
             found.append(engine.field("qacc").float())
     torch.testing.assert_close(found[0], found[1], rtol=2e-4, atol=2e-4 * float(found[0].abs().max()))
+
+
+def test_a_large_dense_model_runs_and_agrees():
+    """More than 60 degrees of freedom with `jacobian="dense"`, for which MuJoCo Warp has only sparse matrices."""
+    chain = "".join(
+        f'<body pos="0 0 0.1"><joint axis="{i % 2} {1 - i % 2} 0" damping="0.1"/><geom size="0.03"/>' for i in range(62)
+    )
+    xml = (
+        '<mujoco><option jacobian="dense" integrator="implicitfast"/><worldbody><geom type="plane" size="5 5 1"/>'
+        f"<body>{chain}{'</body>' * 62}</body></worldbody></mujoco>"
+    )
+    batch, warp = pair(xml, ("xpos",))
+    for engine in (batch, warp):
+        engine.field("qvel")[:] = torch.linspace(-1, 1, 62, dtype=torch.float64)
+        engine.step(5)
+    assert batch.model.opt.jacobian == mujoco.mjtJacobian.mjJAC_DENSE
+    torch.testing.assert_close(warp.field("xpos")[:].double(), batch.field("xpos")[:].double(), rtol=1e-3, atol=1e-4)

@@ -63,6 +63,14 @@ def test_equal_objectives_of_all_trials_are_a_warning(tmp_path, capsys):
     assert "same objective" not in capsys.readouterr().err
 
 
+def test_equal_successes_of_one_are_a_warning_of_a_long_budget(tmp_path, capsys):
+    sweep = open_or_join(tmp_path, objective="success@5s")
+    for _ in range(2):
+        sweep.tell(sweep.claim(), 1.0)
+    print_sweep(sweep)
+    assert "success@5s = 1: the budget may be too long" in capsys.readouterr().err
+
+
 def test_trial_values_depend_on_number_not_process(tmp_path):
     alone = finish(open_or_join(tmp_path / "alone"), 6)
     one, other = open_or_join(tmp_path / "both"), open_or_join(tmp_path / "both")

@@ -300,7 +300,8 @@ def test_markers_and_commands_have_names_and_units(tmp_path):
     env = commanded_env(tmp_path, 2, velocity=velocity, own=given)
     env.command_manager.get_term("own").given = [Sphere(torch.zeros(2, 3))]
     labels = [marker.label for marker in env.markers()]
-    assert labels == ["commanded velocity"] * 2 + ["actual velocity"] * 2 + ["own"]
+    parts = ("velocity", "yaw rate (arrow ahead)")
+    assert labels == [f"{kind} {part}" for kind in ("commanded", "actual") for part in parts] + ["own"]
     knobs = env.command_manager.knobs()
     assert [knob.label for knob in knobs][:3] == ["vx [m/s]", "vy [m/s]", "wz [rad/s]"]
     assert env.command_manager.value(knobs[0], 1) == 1.0

@@ -55,7 +55,8 @@ def command(
     folder, files = create(name, flavour, output, design)
     for file in files:
         console.data(str(folder / file))
-    console.info(f"next: cd {folder} && {pip_install('-e .')} && rlcli train {name}")
+    lint = "" if design is None else f"rlcli lint {name} && "  # a robot may fall at once in its file's pose
+    console.info(f"next: cd {folder} && {pip_install('-e .')} && {lint}rlcli train {name}")
     console.document(
         "new", task=name, flavour=flavour if design is None else design.kind, folder=str(folder), files=files
     )

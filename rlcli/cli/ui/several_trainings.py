@@ -110,10 +110,14 @@ def print_sweep(sweep: Sweep) -> None:
         console.info(f"best: trial {best.number}; its run: {run}")
         console.info(f"to train with its settings: rlcli train {task_reference(settings['source'])} --config {file}")
     if (same := sweep.same_objective()) is not None:
-        console.warn(
-            f"all trials have the same objective, {settings['objective']} = {same:.6g}: the budget may be too short,"
-            " so that no trial is better than another"
+        easy = settings["objective"].startswith("success") and same == 1.0
+        reason = (
+            "the budget may be too long: every trial reaches the highest value; choose a shorter one, such as"
+            " --objective success@10s, or --objective return"
+            if easy
+            else "the budget may be too short, so that no trial is better than another"
         )
+        console.warn(f"all trials have the same objective, {settings['objective']} = {same:.6g}: {reason}")
     console.document(
         "sweep",
         sweep=str(sweep.folder),

@@ -207,6 +207,23 @@ def test_the_reason_for_the_kind_is_printed(cli, tmp_path):
         (POINT.format(kind="hinge"), "balance", "the joints do not move the last body 'point' by more than 1 cm"),
         (UNICYCLE, "balance", "only 2 driven joints"),
         (DOG.replace("<worldbody>", '<option gravity="0 0 0"/><worldbody>'), "balance", "the file sets gravity to 0"),
+        (
+            DOG.replace("<worldbody>", '<option><flag gravity="disable"/></option><worldbody>'),
+            "balance",
+            "the file sets gravity to 0",
+        ),
+        (
+            DOG.replace("<worldbody>", '<option><flag constraint="disable"/></option><worldbody>'),
+            "balance",
+            "the file turns contacts with the ground off",
+        ),
+        (DOG.replace("<geom ", '<geom contype="2" '), "velocity", "4 feet"),
+        (DOG.replace("0 0 0 0 0 -0.2", "0 0 -0.03 0.2 0 -0.03"), "balance", "the trunk touches the ground"),
+        (
+            DOG.replace("<geom ", '<geom contype="2" conaffinity="2" '),
+            "balance",
+            "the file turns contacts with the ground off",
+        ),
     ):
         result, _ = written(cli, tmp_path, text)
         assert f"task: {kind}, because" in result.err
@@ -284,6 +301,40 @@ def test_joint_locked_by_its_damping_is_not_driven(cli, tmp_path):
 def test_gravity_of_the_file_is_kept(cli, tmp_path):
     _, task = written(cli, tmp_path, ARM.replace("<worldbody>", '<option gravity="0 0 0"/><worldbody>'))
     assert task["sim"]["gravity"] == [0.0, 0.0, 0.0]
+
+
+def test_gravity_that_a_flag_turns_off_can_be_set_in_the_task(cli, tmp_path):
+    text = DOG.replace("<worldbody>", '<option><flag gravity="disable"/></option><worldbody>')
+    _, task = written(cli, tmp_path, text)
+    assert task["sim"]["gravity"] == [0.0, 0.0, 0.0]
+    path = tmp_path / "my-robot" / "my_robot"
+    for gravity, falls in ((0.0, False), (-9.81, True)):
+        task["sim"]["gravity"][2] = gravity
+        (path / "task.yaml").write_text(yaml.safe_dump(task))
+        env = make("my-robot/my_robot", num_envs=1)
+        env.reset()
+        start = float(env.engine.field("qpos")[0, 2])
+        for _ in range(20):
+            env.step(torch.zeros(1, 4))
+        assert (float(env.engine.field("qpos")[0, 2]) < start - 0.01) == falls
+
+
+def test_robot_without_collisions_stands_on_the_ground_in_its_default_pose(cli, tmp_path):
+    _, task = written(cli, tmp_path, DOG.replace("<geom ", '<geom contype="0" conaffinity="0" '))
+    assert task["scene"]["entities"]["robot"]["pos"][2] == pytest.approx(0.2205, abs=1e-3)
+
+
+def test_the_next_command_checks_whether_the_robot_stands(cli, tmp_path):
+    result, _ = written(cli, tmp_path, DOG)
+    assert " && rlcli lint my-robot && rlcli train my-robot\n" in result.err
+
+
+def test_the_package_is_described_by_the_task_of_the_robot(cli, tmp_path):
+    written(cli, tmp_path, ARM)
+    assert (
+        'description = "Bring the last body to goals (my-robot)."\n'
+        in (tmp_path / "my-robot" / "pyproject.toml").read_text()
+    )
 
 
 def test_velocities_fit_the_size_of_the_robot(cli, tmp_path):
