@@ -5,6 +5,7 @@ It attaches robots and objects, adds ground, lights, sensors and terrain, and co
 
 from __future__ import annotations
 
+import logging
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -32,6 +33,8 @@ _OPTIONS = (
     "wind", "magnetic", "disableflags", "enableflags", "disableactuator",
 )  # fmt: skip
 """Physics options that the scene takes from the first MJCF."""
+
+_log = logging.getLogger(__name__)
 
 View = TypeVar("View")
 
@@ -159,6 +162,11 @@ class Scene:
         option = self.spec.option
         option.timestep = self.sim.dt
         option.gravity = self.sim.gravity
+        if option.disableflags & int(mujoco.mjtDisableBit.mjDSBL_GRAVITY) and any(self.sim.gravity):
+            _log.warning(
+                'scene: <flag gravity="disable"/> of the MJCF turns gravity off, so that sim.gravity has no effect;'
+                " remove the flag, or set sim.gravity to [0, 0, 0]"
+            )
         if self.sim.integrator is not None:
             option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{self.sim.integrator.upper()}")
         if self.sim.iterations is not None:

@@ -76,6 +76,16 @@ def test_joint_overrides_change_only_named_joints(tmp_path):
     assert np.ravel(model.jnt_stiffness[s])[0] == 0.0
 
 
+@pytest.mark.parametrize("gravity", [[0.0, 0.0, -9.81], [0.0, 0.0, 0.0]])
+def test_gravity_that_the_mjcf_turns_off_is_reported(tmp_path, caplog, gravity):
+    xml = ARM.replace(
+        '<option integrator="implicitfast" iterations="7"/>', '<option><flag gravity="disable"/></option>'
+    )
+    model_of(tmp_path, xml=xml, sim={"gravity": gravity})
+    said = any("sim.gravity has no effect" in record.getMessage() for record in caplog.records)
+    assert said == any(gravity)
+
+
 def test_joint_overrides_merge_keys_and_later_pattern_wins(tmp_path):
     model = model_of(tmp_path, robot={"joints": {".*": {"damping": 1.0, "armature": 0.1}, "elbow": {"damping": 5.0}}})
     assert np.ravel(model.dof_damping[dof(model, "robot/shoulder")])[0] == 1.0
