@@ -669,3 +669,11 @@ def test_package_of_a_repository_with_the_name_of_isaac_labs_tasks(tmp_path, mon
     for file in ("rover.xml", "models.yaml"):
         shutil.copy(own / "rover_of_test" / file, own / "packed" / file)
     resolve(find_task(f"{own / 'packed' / 'rover_env.py'}:RoverEnvCfg"))
+
+
+def test_missing_files_of_isaac_labs_tasks_are_named_with_the_setting(tmp_path, monkeypatch):
+    monkeypatch.delenv("RLCLI_ISAACLAB", raising=False)
+    module = "isaaclab_tasks.manager_based.manipulation.reach.reach_env_cfg"
+    with pytest.raises(TaskError, match="cannot import name 'ReachEnvCfg'") as caught:
+        rover(tmp_path / "rover", f"from {module} import ReachEnvCfg\n")
+    assert "set RLCLI_ISAACLAB to its folder isaaclab/source" in str(caught.value.hint)
