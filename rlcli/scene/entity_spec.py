@@ -169,19 +169,36 @@ def _shape_model(entity: EntityConfig) -> mujoco.MjSpec:
     body = child.worldbody.add_body(name="body", mocap=entity.mocap)
     if entity.free:
         body.add_freejoint(name="root")
-    kind = getattr(mujoco.mjtGeom, f"mjGEOM_{entity.shape.upper()}")
+    kind = getattr(mujoco.mjtGeom, "mjGEOM_MESH" if entity.shape == "cone" else f"mjGEOM_{entity.shape.upper()}")
     half = [edge / 2 for edge in entity.size]  # MuJoCo's sizes are half lengths
     sizes = {
         "box": half,
         "sphere": entity.size,
         "cylinder": [entity.size[0], half[-1]],
         "capsule": [entity.size[0], half[-1]],
+        "cone": [],
         "plane": [*half, 1.0],
     }
     size = sizes[entity.shape]
+    if entity.shape == "cone":
+        child.add_mesh(name="cone", uservert=_cone(entity.size[0], entity.size[1]).ravel().tolist())
     body.add_geom(
         name="geom", type=kind, size=[*size, *[0.0] * (3 - len(size))], rgba=[*entity.color, 1.0],
         friction=[entity.friction, 0.005, 0.0001], density=entity.density or 1000.0,
-        mass=np.nan if entity.mass is None else entity.mass,
+        mass=np.nan if entity.mass is None else entity.mass, quat=_FROM_Z[entity.axis],
+        contype=int(entity.collides), conaffinity=int(entity.collides),
+        meshname="cone" if entity.shape == "cone" else "",
     )  # fmt: skip
     return child
+
+
+_FROM_Z = {"x": (0.5**0.5, 0.0, 0.5**0.5, 0.0), "y": (0.5**0.5, -(0.5**0.5), 0.0, 0.0), "z": (1.0, 0.0, 0.0, 0.0)}
+"""Axis -> quaternion (w, x, y, z) that turns the z axis onto it."""
+
+
+def _cone(radius: float, length: float, edges: int = 32) -> FloatArray:
+    """Return the corners of a pyramid with the volume of a cone, whose tip is at z = length / 2. (edges + 1, 3) [m]"""
+    angles = 2.0 * np.pi * np.arange(edges) / edges
+    outer = radius * np.sqrt(angles[1] / np.sin(angles[1]))  # a polygon of this radius has the area of the circle
+    ring = np.stack([outer * np.cos(angles), outer * np.sin(angles), np.full(edges, -length / 2.0)], axis=1)
+    return np.concatenate([ring, [[0.0, 0.0, length / 2.0]]])

@@ -157,55 +157,82 @@ class _EnvPair:
     Args:
         subject: the task.
         scale: factor of the random actions in `ended`; with 1 both get the same actions.
+        keeps_torch: whether the ends and resets of episodes leave torch's generator unchanged.
     """
 
-    def __init__(self, subject: TaskUnderTest, scale: float = 1.0) -> None:
+    def __init__(self, subject: TaskUnderTest, scale: float = 1.0, keeps_torch: bool = False) -> None:
         self.kept, self.ended = subject.env(episode_steps=50), subject.env(episode_steps=50)
         self._actions, self._steps, self._scale = random_actions(self.kept, subject.bound), 0, scale
+        self.drew_differently = False
+        """Whether `kept` and `ended` drew different numbers from torch's generator in a step."""
         for env in (self.kept, self.ended):
             torch.manual_seed(0)
             env.reset(seed=env.seed)
+            if keeps_torch:
+                keep = torch.random.fork_rng(devices=[])
+                env._compute_final_obs = keep(env._compute_final_obs)  # type: ignore[method-assign]
+                env._reset_ended = keep(env._reset_ended)  # type: ignore[method-assign]
 
     def step(self, count: int = 1) -> tuple[StepResult, StepResult]:
         """Step `kept` and `ended` with the next random actions, `count` times; return both results of the last step."""
         for _ in range(count):
             action = next(self._actions)
             self._steps += 1
-            results = []
+            results, generators = [], []
             for env, factor in ((self.kept, 1.0), (self.ended, self._scale)):
                 torch.manual_seed(self._steps)  # draws from torch's own generator are checked by `same-seed`
                 results.append(env.step(factor * action))
+                generators.append(torch.get_rng_state())
+            self.drew_differently |= not torch.equal(*generators)
         return results[0], results[1]
 
 
-def _env_pair(subject: TaskUnderTest) -> _EnvPair:
-    """Return a pair in equal states, for checks of partial resets.
+def _env_pair(subject: TaskUnderTest, keeps_torch: bool = False) -> _EnvPair:
+    """Return a pair in equal states, for checks of partial resets; see `_EnvPair` for `keeps_torch`.
 
     In the next step the episodes of the environments `_ENDING` reach their time limit in `ended`, but not in `kept`.
     """
-    pair = _EnvPair(subject)
+    pair = _EnvPair(subject, keeps_torch=keeps_torch)
     pair.step(5)
     expire_episodes(pair.ended, _ENDING)
     return pair
 
 
 def partial_reset(subject: TaskUnderTest) -> Iterator[Finding]:
-    """Check that a reset of some environments leaves the others bit-identical."""
-    pair = _env_pair(subject)
+    """Check that a reset of some environments leaves the others bit-identical.
+
+    If draws from torch's generator explain a difference of another framework's task, the finding is a warning: the
+    numbers that a reset draws are missing for the other environments, as in that framework.
+    """
+    found = _changed_by_reset(_env_pair(subject))
+    if found is not None and subject.resolved.format is not None:
+        pair = _env_pair(subject, keeps_torch=True)
+        other = _changed_by_reset(pair)
+        if other is None or pair.drew_differently:
+            hint = "nothing to do: all environments draw from one generator, so that a reset changes later draws"
+            yield warning_at(found.where, f"{found.message} (code of the task draws from torch's generator)", hint)
+            return
+        found = other
+    if found is not None:
+        yield found
+
+
+def _changed_by_reset(pair: _EnvPair) -> Finding | None:
+    """Return the first difference between `kept` and `ended` in environments that did not reset; None: none."""
     for number in range(6):
         kept, ended = pair.step()
         pairs = {name: (value, engine_state(pair.ended)[name]) for name, value in engine_state(pair.kept).items()}
         pairs |= {name: (value, step_outputs(ended)[name]) for name, value in step_outputs(kept).items()}
         for name, (a, b) in pairs.items():
-            rows = [row for row in range(subject.num_envs) if row not in _ENDING and not equal_values(a[row], b[row])]
+            rows = [row for row in range(pair.kept.num_envs) if row not in _ENDING and not equal_values(a[row], b[row])]
             if rows:
                 later = f", {number} steps later" if number else ""
                 where = "the simulation's state" if name == "state" else name
                 message = f"values of environments {rows} changed when environments {_ENDING} were reset{later}"
                 hint = "write only to the rows of the environments that reset (`selection` or `env_ids`), and use no"
                 hint += " averages over environments"
-                yield error_at(where, f"{message}; these values must stay bit-identical", hint)
-                return
+                return error_at(where, f"{message}; these values must stay bit-identical", hint)
+    return None
 
 
 def final_observations(subject: TaskUnderTest) -> Iterator[Finding]:

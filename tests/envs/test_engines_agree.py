@@ -81,6 +81,24 @@ def test_engines_agree_through_resets(task):
     assert ended >= 2 * N
 
 
+@pytest.mark.parametrize("kept", [("reset_cart", "reset_pole"), ("reset_pole",), ()], ids=["all", "pole", "none"])
+def test_engines_agree_on_states_that_resets_keep(kept):
+    """Joints without a reset event go on from the last state of the episode; `kept` are the events that are removed."""
+    overrides = [f"events.{name}=null" for name in kept]
+    host, device = pair("cartpole", N, *SHORT["cartpole"], "keep_state_at_reset=true", *overrides)
+    ended = follow(host, device, 1e-4, 3 * host.max_episode_length + 2)
+    assert ended >= 3 * N
+    for env in (host, device):
+        env.episode_length_buf[::2] = env.max_episode_length - 1
+        data = env.entities["robot"].data
+        before, speed = data.joint_pos[::2].clone(), data.joint_vel[::2].clone()
+        assert env.step(torch.zeros(N, 1)).truncated[::2].all()
+        jump = (data.joint_pos[::2] - before - speed * env.step_dt).abs().amax(dim=0)
+        for joint, name in enumerate(("reset_cart", "reset_pole")):
+            assert bool(jump[joint] < 0.05) is (name in kept)
+            assert before[:, joint].abs().max() > 0.1
+
+
 @pytest.mark.parametrize("task", ["cartpole", "cartpole-direct"])
 def test_engines_agree_through_terminations(task):
     host, device = pair(task, N)

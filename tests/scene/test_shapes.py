@@ -58,6 +58,17 @@ def test_free_shape_rests_at_height_of_its_size(tmp_path, engine):
         assert env.entities[name].data.root_pos_w[:, 2].tolist() == pytest.approx([height] * 2, abs=2e-3), name
 
 
+@ENGINES
+def test_cone_rests_on_its_base_and_a_shape_without_collisions_falls_through_the_ground(tmp_path, engine):
+    env = scene(tmp_path, {
+        "cone": free("cone", [0.2, 0.4], [0.0, 0.0, 0.21], mass=1.0),
+        "ghost": free("sphere", [0.1], [2.0, 0.0, 0.1], collides=False),
+    }, f"sim.engine={engine}")  # fmt: skip
+    rest(env, 60)
+    assert env.entities["cone"].data.root_pos_w[:, 2].tolist() == pytest.approx([0.2] * 2, abs=2e-3)
+    assert (env.entities["ghost"].data.root_pos_w[:, 2] < -1.0).all()
+
+
 def test_mass_and_density_are_written_to_model(tmp_path):
     model = scene(tmp_path, {
         "heavy": free("box", [0.4, 0.3, 0.2], [0.0, 0.0, 1.0], mass=7.0),
@@ -198,6 +209,8 @@ def test_trajectory_with_objects_is_independent_of_num_envs(tmp_path):
             "free and mocap cannot be combined: remove one",
         ),
         ({"shape": "plane", "size": [1.0, 1.0], "free": True}, "a plane cannot move"),
+        ({"shape": "box", "size": [1.0, 1.0, 1.0], "axis": "x"}, "a box has no axis"),
+        ({"model": "cart.xml", "collides": False}, "'collides' is only allowed with `shape`"),
         ({"shape": "sphere", "size": [1.0], "mass": 0.0}, "robot.mass: expected a number > 0, found 0"),
         (
             {"shape": "sphere", "size": [1.0], "init": {"lin_vel": [1.0, 0.0, 0.0]}},

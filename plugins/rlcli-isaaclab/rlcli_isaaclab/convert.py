@@ -237,9 +237,11 @@ def _policy(top: Node) -> Node:
     if "policy" in top or "actor" not in top:
         return top.node("policy")
     actor, critic = top.node("actor"), top.node("critic")
-    for model in (actor, critic):
-        if model.get("class_name", "MLPModel") != "MLPModel":
-            top.report.problem(model.key, f"'{model.get('class_name')}' has no counterpart in rlcli", "use MLPModel")
+    recurrent = [_require_class(model, "MLPModel", "RNNModel") == "RNNModel" for model in (actor, critic)]
+    memory = [{key: model.get(key) for key in _RNN_KEYS} for model in (actor, critic)]
+    if recurrent[0] != recurrent[1] or (all(recurrent) and memory[0] != memory[1]):
+        what = "the networks of actor and critic differ in class_name or in their rnn_ settings"
+        top.report.problem(critic.key, what, "give both networks the same class_name, rnn_type and rnn_hidden_dim")
     distribution = actor.node("distribution_cfg")
     if distribution.get("class_name", "GaussianDistribution").rpartition(".")[2] != "GaussianDistribution":
         what = "this distribution of actions has no counterpart in rlcli"
@@ -255,8 +257,13 @@ def _policy(top: Node) -> Node:
         "init_noise_std": distribution.get("init_std", 1.0),
         "noise_std_type": distribution.get("std_type", "scalar"),
     }
+    if recurrent[0]:
+        data |= {"class_name": "ActorCriticRecurrent", **memory[0]}
     top.get("policy")
     return Node(data, ("policy",), top.report)
+
+
+_RNN_KEYS = ("rnn_type", "rnn_hidden_dim", "rnn_num_layers")
 
 
 def _network(policy: Node, name: str) -> dict[str, Any]:

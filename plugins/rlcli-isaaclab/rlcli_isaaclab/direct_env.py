@@ -23,9 +23,9 @@ from torch import Tensor
 
 from rlcli.errors import ConfigError, Problem, TaskError
 from rlcli_isaaclab.config_class import MISSING, configclass, fill_missing
-from rlcli_isaaclab.missing_names import user_place
 from rlcli_isaaclab.setup_scene import Setup, running
 from rlcli_isaaclab.sim import SimulationCfg
+from rlcli_isaaclab.simulation import Simulation
 from rlcli_isaaclab.task_fields import set_valid_fields
 from rlcli_isaaclab.user_files import adapt_to_device
 
@@ -60,10 +60,7 @@ class DirectRLEnv(gymnasium.Env):
             self._setup_scene()
             raise _Recorded(self)
         self.cfg, self.managed, self.render_mode = cfg, managed, render_mode
-        self.sim = SimpleNamespace(
-            device=str(managed.device), cfg=cfg.sim, has_gui=lambda: False, has_rtx_sensors=lambda: False,
-            set_camera_view=lambda **view: None, get_physics_dt=lambda: managed.physics_dt, step=_refuse_step,
-        )  # fmt: skip
+        self.sim = Simulation(cfg.sim, str(managed.device), managed.physics_dt)
         self.scene = Scene(managed)
         self.extras: dict[str, Any] = {}
         n, device = managed.num_envs, managed.device
@@ -204,12 +201,6 @@ class DirectRLEnv(gymnasium.Env):
         """Do nothing: rlcli does not draw the markers of direct tasks."""
 
 
-def _refuse_step(*args: Any, **options: Any) -> None:
-    """Raise a TaskError, because a task may not step the simulation itself, for example in a reset."""
-    what = f"{user_place()}env.sim.step cannot be used: a task cannot step the simulation itself"
-    raise TaskError(what, hint="rlcli steps all environments at once; set joint positions in a reset instead")
-
-
 class DirectMARLEnv(gymnasium.Env):
     """A multi-agent task, which rlcli does not support."""
 
@@ -338,7 +329,7 @@ class _Shell:
         self.device, self.num_envs = "cpu", cfg.scene.num_envs
         self.entities: dict[str, Any] = {}
         self.physics_dt, self.step_dt = cfg.sim.dt, cfg.sim.dt * cfg.decimation
-        self.sim = SimpleNamespace(device="cpu", cfg=cfg.sim, has_gui=lambda: False)
+        self.sim = Simulation(cfg.sim, "cpu", cfg.sim.dt)
         self.scene = SimpleNamespace(
             cfg=cfg.scene, articulations={}, rigid_objects={}, sensors={}, extras={}, deformable_objects={},
             clone_environments=lambda **options: None, filter_collisions=lambda **options: None,

@@ -74,12 +74,16 @@ class DirectRunner:
             self.lab: DirectRLEnv = adapt_to_device(term.env_class, managed.device)(cfg)
         for asset in self.lab.scene.articulations.values():
             asset.start_wrenches(by_task=True)
-        self.action_noise = noise_model(cfg.action_noise_model, managed)
-        self.observation_noise = noise_model(cfg.observation_noise_model, managed)
+        self._start_noise()
         facade_of(managed).extras = self.lab.extras  # events of the configuration get this object as `env`
         managed.task_log = self.log = ExtrasLog(lambda: self.lab.extras, _OWN_METRICS)
         self._memory = AttributeState(self.lab, excluded=("cfg", "managed", "sim", "scene", "rlcli_fire_resets"))
         self._observed: dict[str, Tensor] = {}
+
+    def _start_noise(self) -> None:
+        """Create the noise models, without biases of earlier episodes."""
+        self.action_noise = noise_model(self.cfg.action_noise_model, self.managed)
+        self.observation_noise = noise_model(self.cfg.observation_noise_model, self.managed)
 
     def apply(self) -> None:
         """Call `_apply_action`, and write the task's forces, before a physics step."""
@@ -122,7 +126,12 @@ class DirectRunner:
         self.phase = "done"
 
     def reset_envs(self, selection: Selection) -> None:
-        """Call `_reset_idx` for the selected environments, and reset the noise models there."""
+        """Call `_reset_idx` for the selected environments, and reset the noise models there.
+
+        At a reset with a seed, noise models start anew: the biases of an additive noise would add up over its episodes.
+        """
+        if self.managed.common_step == 0:
+            self._start_noise()
         ids = selection.env_ids()
         if len(ids):
             events, step = self.managed.event_manager, self.managed._counters.common_step

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 
 from rlcli.errors import did_you_mean, listing
-from rlcli_isaaclab.namespace import public_names
+from rlcli_isaaclab.namespace import SOURCE, SOURCE_PACKAGES, public_names
 
 
 def import_hint(error: BaseException) -> str | None:
@@ -25,9 +25,15 @@ def import_hint(error: BaseException) -> str | None:
     if not isinstance(error, ImportError) or not module.startswith(("rlcli_isaaclab", "isaaclab")):
         return None
     name = str(error).partition("'")[2].partition("'")[0]
+    if module.partition(".")[0] in SOURCE_PACKAGES and not module.startswith("isaaclab_tasks.utils") and not error.path:
+        return _NO_FILES.format(module.partition(".")[0])
     known = dir(sys.modules[module]) if module in sys.modules else public_names(module)
     return "; ".join(filter(None, (_NEWER.format(name), did_you_mean(name, known) or _ALL)))
 
 
 _NEWER = "Isaac Lab 2.3.2 has no '{}' (a newer or changed Isaac Lab may have it)"
+_NO_FILES = (
+    "the files of {} were not found, and a task derives from them: download and unzip Isaac Lab's wheel"
+    f" (pip download --no-deps isaaclab==2.3.2.post1), and set {SOURCE} to its folder isaaclab/source"
+)
 _ALL = "docs/guides/isaac-lab.md and docs/reference/isaac-lab-terms.md list the names"

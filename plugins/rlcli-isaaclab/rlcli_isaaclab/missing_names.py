@@ -31,7 +31,6 @@ _REASONS = {
         "it loads a TorchScript policy, and rlcli unpickles nothing",
         "train the low-level policy, and write the task without it",
     ),
-    "read_file": ("it reads files of NVIDIA's server, and rlcli downloads nothing", "open a local file in the task"),
     "output[": ("rlcli's cameras have no such images", "use rgb, depth, distance_to_image_plane or distance_to_camera"),
     "nodal": ("rlcli simulates rigid bodies only", "replace the soft body by a rigid one"),
     "deformable": ("rlcli simulates rigid bodies only", "replace the soft body by a rigid one"),

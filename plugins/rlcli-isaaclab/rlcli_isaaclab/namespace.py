@@ -77,7 +77,7 @@ _LIBRARY_NAMES = {
     **{"math": "math", "re": "re", "torch": "torch", "Literal": "typing", "Sequence": "collections.abc"},
 }
 """Name in `_STAR_NAMES` -> the module with this name, or the module that defines the name."""
-_SOURCE_PACKAGES = ("isaaclab_tasks", "isaaclab_assets")
+SOURCE_PACKAGES = ("isaaclab_tasks", "isaaclab_assets")
 """Packages whose original files are imported if they are found, because their code only uses other modules."""
 _TORCH = "isaacsim.core.utils.torch"
 _SIM = {
@@ -114,7 +114,7 @@ def module_of(name: str, file: str) -> ModuleType | None:
     """
     top, _, inner = name.partition(".")
     # `isaaclab_tasks.utils` is replaced by this package's `task_utils`
-    if top in _SOURCE_PACKAGES and not inner.startswith("utils"):
+    if top in SOURCE_PACKAGES and not inner.startswith("utils"):
         folder = _source_folder(top, Path(file).parent, inner.partition(".")[0])
         if folder is not None:
             return _of_source(name, folder, inner)

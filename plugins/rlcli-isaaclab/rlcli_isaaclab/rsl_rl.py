@@ -58,6 +58,24 @@ class RslRlMLPModelCfg:
 
 
 @configclass
+class RslRlRNNModelCfg(RslRlMLPModelCfg):
+    """Settings of one network with a recurrent layer (GRU or LSTM) in front of the MLP, as RSL-RL 5 has them."""
+
+    class_name: str = "RNNModel"
+    rnn_type: str = MISSING
+    rnn_hidden_dim: int = MISSING
+    rnn_num_layers: int = MISSING
+
+
+@configclass
+class RslRlCNNModelCfg(RslRlMLPModelCfg):
+    """Settings of one network for images, as RSL-RL 5 has them. rlcli refuses them: it builds its own networks."""
+
+    class_name: str = "CNNModel"
+    cnn_cfg: Any = MISSING
+
+
+@configclass
 class RslRlSymmetryCfg:
     """Settings of the robot's symmetry in the PPO update: mirrored samples, or a loss for unequal mirrored actions."""
 

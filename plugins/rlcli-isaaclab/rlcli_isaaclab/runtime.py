@@ -32,6 +32,7 @@ from rlcli_isaaclab.missing_names import user_place
 from rlcli_isaaclab.multirotor import Multirotor
 from rlcli_isaaclab.scene_facade import Scene
 from rlcli_isaaclab.settings import kind_of
+from rlcli_isaaclab.simulation import Simulation
 
 
 class ManagerBasedRLEnv(gymnasium.Env):
@@ -239,6 +240,11 @@ class ManagerBasedRLEnv(gymnasium.Env):
     def unwrapped(self) -> Any:
         """The environment itself, which has no wrappers."""
         return self
+
+    @property
+    def sim(self) -> Simulation:
+        """Settings of the simulation under Isaac Lab's names."""
+        return Simulation(self.cfg.sim, str(self.managed.device), self.managed.physics_dt)
 
     @property
     def observation_manager(self) -> Any:

@@ -17,7 +17,8 @@ from rlcli_isaaclab.model_lookup import given_models, is_end_of, mjcf_of, model_
 from rlcli_isaaclab.own_classes import note_own_class
 from rlcli_isaaclab.sensor_reader import camera_kinds, filter_name, image_name, read_filters, read_sensor
 from rlcli_isaaclab.settings import Key, Node, Report, as_float, base_kind, kind_of
-from rlcli_isaaclab.terrain_reader import read_friction, read_ground, read_terrain
+from rlcli_isaaclab.shape_reader import SHAPES, read_root_velocity, read_shape
+from rlcli_isaaclab.terrain_reader import read_ground, read_terrain
 
 
 class SceneReader:
@@ -290,9 +291,9 @@ class SceneReader:
         if isinstance(path, str):
             self._paths[name] = path
         path = self._given_models.get(name, path)
-        shape = _SHAPES.get(kind_of(spawn.data.get("func"))) if spawn and path is None else None  # a model overrides
+        shape = SHAPES.get(kind_of(spawn.data.get("func"))) if spawn and path is None else None  # a model overrides
         if spawn and shape:
-            self.entities[name] = self._read_shape(item, spawn, shape)
+            self.entities[name] = read_shape(item, spawn, shape)
             return
         several = spawn is not None and (
             bool(spawn.data.get("assets_cfg")) or isinstance(spawn.data.get("usd_path"), list)
@@ -305,8 +306,7 @@ class SceneReader:
             return
         if not isinstance(path, str):
             found = f"`spawn` calls {kind_of(spawn.data.get('func'))}" if spawn else "`spawn` is not set"
-            message = f"no model: {found}; write spawn=UsdFileCfg(usd_path='{name}.xml')"
-            self.report.problem(item.key, message)
+            self.report.problem(item.key, f"no model: {found}", model_hint(name))
             return
         spawn = spawn or item.node("spawn")
         try:
@@ -328,7 +328,7 @@ class SceneReader:
         if rotation != root_rotation:
             entity["quat"] = rotation
         self._read_joint_state(name, entity, init)
-        self._read_root_velocity(entity, init)
+        read_root_velocity(entity, init)
         factor = item.get("soft_joint_pos_limit_factor", 1.0)
         if factor != 1.0:
             entity["soft_joint_pos_limit_factor"] = as_float(factor)
@@ -344,36 +344,6 @@ class SceneReader:
         if explicit:
             entity["actuators"] = explicit
         self.entities[name] = entity
-
-    def _read_shape(self, item: Node, spawn: Node, shape: str) -> dict[str, Any]:
-        """Return the settings of an entity with one geom.
-
-        A rigid object moves freely, a kinematic one is a mocap body; any other shape is fixed in the world.
-        """
-        size = spawn.get("size") or [spawn.get(key) for key in ("radius", "height") if spawn.get(key) is not None]
-        config: dict[str, Any] = {"shape": shape, "size": [as_float(v) for v in size]}
-        rigid, mass = spawn.data.get("rigid_props") or {}, spawn.node("mass_props")
-        if rigid.get("kinematic_enabled"):
-            config["mocap"] = True
-            spawn.node("rigid_props").mark_mapped("kinematic_enabled")
-        elif kind_of(item.data.get("class_type")) == "RigidObject" or rigid:
-            config |= {"free": True, "velocity_point": "com"}
-        config |= read_body_properties(spawn)
-        for key in ("mass", "density"):
-            if mass.get(key):
-                config[key] = as_float(mass.get(key))
-        if "physics_material" in spawn:
-            config |= read_friction(spawn.node("physics_material"))
-        look = spawn.node("visual_material")
-        if look.get("diffuse_color") is not None:
-            config["color"] = [as_float(v) for v in look.get("diffuse_color")]
-        init = item.node("init_state")
-        config["pos"] = [as_float(v) for v in init.get("pos", (0.0, 0.0, 0.0))]
-        config["quat"] = [as_float(v) for v in init.get("rot", (1.0, 0.0, 0.0, 0.0))]
-        self._read_root_velocity(config, init)
-        spawn.mark_mapped("func", "visible", "semantic_tags", "copy_from_source", "activate_contact_sensors", "axis")
-        spawn.mark_mapped("visual_material_path", "physics_material_path", "visual_material", "collision_props")
-        return config
 
     def _read_model(self, name: str, model: str) -> None:
         """Compile an entity's MJCF, and store the names and values that other settings refer to in `_models`."""
@@ -429,22 +399,7 @@ class SceneReader:
         if config:
             entity["init"] = config
 
-    def _read_root_velocity(self, entity: dict[str, Any], init: Node) -> None:
-        for key in ("lin_vel", "ang_vel"):
-            value = [as_float(v) for v in init.get(key, (0.0, 0.0, 0.0))]
-            if any(value):
-                entity.setdefault("init", {})[key] = value
-
     def _has_value(self, init: Node, entity: str, pattern: str, value: float, known: Mapping[str, float]) -> bool:
         """Return whether all joints that a pattern matches have a value in `known` (joint name -> value, else 0)."""
         matched = self.report.matching([pattern], self.names(entity, "joint") or [], init.key)
         return bool(matched) and all(known.get(n, 0.0) == value for n in matched)
-
-
-_SHAPES = {
-    "spawn_cuboid": "box",
-    "spawn_sphere": "sphere",
-    "spawn_cylinder": "cylinder",
-    "spawn_capsule": "capsule",
-}
-"""Isaac Lab's spawn function -> rlcli's shape."""

@@ -89,6 +89,11 @@ SphereCfg = _settings_class("SphereCfg", "A sphere.", func=Spawn("spawn_sphere")
 CapsuleCfg = _settings_class("CapsuleCfg", "A capsule.", func=Spawn("spawn_capsule"))
 CylinderCfg = _settings_class("CylinderCfg", "A cylinder.", func=Spawn("spawn_cylinder"))
 ConeCfg = _settings_class("ConeCfg", "A cone.", func=Spawn("spawn_cone"))
+MeshCuboidCfg = _settings_class("MeshCuboidCfg", "A mesh of a box.", func=Spawn("spawn_mesh_cuboid"))
+MeshSphereCfg = _settings_class("MeshSphereCfg", "A mesh of a sphere.", func=Spawn("spawn_mesh_sphere"))
+MeshCapsuleCfg = _settings_class("MeshCapsuleCfg", "A mesh of a capsule.", func=Spawn("spawn_mesh_capsule"))
+MeshCylinderCfg = _settings_class("MeshCylinderCfg", "A mesh of a cylinder.", func=Spawn("spawn_mesh_cylinder"))
+MeshConeCfg = _settings_class("MeshConeCfg", "A mesh of a cone.", func=Spawn("spawn_mesh_cone"))
 
 
 @configclass

@@ -10,6 +10,14 @@ from rlcli_isaaclab.direct_env import MANAGED
 from rlcli_isaaclab.missing_names import absence
 
 
+def _entities() -> Any:
+    """Return the entities of the environment that is being built: name -> entity."""
+    managed = MANAGED.get(None)
+    if managed is None:
+        raise absence("the USD stage after the start", hint="read the pose of the asset from its `data`")
+    return managed.entities
+
+
 class Prim:
     """Prim of a body or entity in the first environment; the last part of its path is the name."""
 
@@ -24,7 +32,7 @@ class Prim:
     def pose(self) -> tuple[Any, Any]:
         """Return position (3,) [m] and quaternion (w, x, y, z) of the body in the world frame."""
         name = self.path.rstrip("/").rsplit("/", 1)[-1]
-        for entity in MANAGED.get().entities.values():
+        for entity in _entities().values():
             bodies = list(entity.names["Bodies"])
             if name in bodies:
                 index = bodies.index(name)
@@ -43,7 +51,7 @@ class Stage:
         from rlcli_isaaclab.usd_geometry import prims_below
 
         name = str(path).rstrip("/").rsplit("/", 1)[-1].lower()
-        return prims_below(str(path))[0] if name in MANAGED.get().entities else Prim(str(path))
+        return prims_below(str(path))[0] if name in _entities() else Prim(str(path))
 
 
 class _Xformable:

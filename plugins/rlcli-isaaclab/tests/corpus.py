@@ -2,8 +2,8 @@
 
 Usage: python corpus.py [ID ...] [--stage NAME] [--processes N] [--out FILE.jsonl], with the environment variable
 ISAACLAB_SOURCE at the folder `source` of Isaac Lab 2.3.2, or of its unpacked wheel. Each robot gets a stand-in model
-(`standins.py`). With `--package FOLDER` it runs the tasks that another package registers. When a task ends, FILE gets
-one line of JSON; tasks that have a line are not run again.
+(`standins.py`). With `--package PATH` it runs the tasks that another package or file registers. When a task ends, FILE
+gets one line of JSON; tasks that have a line are not run again.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def tasks(package: Path) -> dict[str, dict[str, Any]]:
     from rlcli.registry.failed_imports import take_failures
     from rlcli.registry.task_imports import import_file, registrations
 
-    import_file(package / "__init__.py")
+    import_file(package / "__init__.py" if package.is_dir() else package)
     for file in sorted(package.rglob("__init__.py")):
         if any(word in str(file) for word in OUTSIDE):
             try:
@@ -261,7 +261,7 @@ def main_() -> None:
     parser.add_argument("--steps", type=int, default=STEPS, help="steps of the stage `steps`")
     parser.add_argument("--page", type=Path, help="page whose table is written from the results")
     parser.add_argument("--merge", type=Path, nargs="*", help="write the page from files of --out, and run nothing")
-    parser.add_argument("--package", type=Path, help="folder of another package that registers tasks")
+    parser.add_argument("--package", type=Path, help="another package or file that registers tasks")
     options = parser.parse_args()
     if options.merge:
         rows = rows_of(options.merge)

@@ -379,8 +379,8 @@ def test_runner_of_rsl_rl_5():
         {"hidden": [16], "activation": "tanh"},
     )
     assert (config["init_std"], config["std"], config["normalize_observations"]) == (0.5, "log", True)
-    with pytest.raises(ConfigError, match="'RNNModel' has no counterpart"):
-        agent({**RUNNER_5, "actor": {**RUNNER_5["actor"], "class_name": "RNNModel"}}, Report())
+    with pytest.raises(ConfigError, match="'CNNModel' has no counterpart"):
+        agent({**RUNNER_5, "actor": {**RUNNER_5["actor"], "class_name": "CNNModel"}}, Report())
 
 
 CUDA = """

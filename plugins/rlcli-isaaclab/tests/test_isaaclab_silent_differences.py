@@ -203,10 +203,10 @@ RANDOM = RESET + "        self.observed[env_ids] = torch.rand(len(env_ids), devi
 LONG = (("        self.observed += 1\n", ""), ("episode_length_s = 0.2", "episode_length_s = 1.0"))
 
 
-def checked(pole, tmp_path, *changes):
-    """Write the direct task with replaced parts of its text; return check -> finding of seeds and truncations."""
+def checked(pole, tmp_path, *changes, only=("same-seed", "truncation")):
+    """Write the direct task with replaced parts of its text; return check -> finding of some checks."""
     pole(*changes)
-    report = check_task(f"{tmp_path}/pole/pole_env.py:PoleEnvCfg", only=["same-seed", "truncation"])
+    report = check_task(f"{tmp_path}/pole/pole_env.py:PoleEnvCfg", only=list(only))
     return {finding.check: finding for finding in report}
 
 
@@ -236,6 +236,34 @@ def test_check_accepts_episodes_of_full_length(pole, tmp_path):
 def test_check_rejects_differences_that_torchs_generator_does_not_explain(pole, tmp_path, code):
     found = checked(pole, tmp_path, (RESET, f"{RESET}        {code}\n"), *LONG)
     assert found["same-seed"].severity == "error"
+
+
+NOISY = (
+    'return {"policy": torch.cat([velocity,',
+    'return {"policy": torch.cat([torch.randn_like(velocity) + velocity,',
+)
+
+
+def test_check_warns_of_later_draws_that_a_reset_changes(pole, tmp_path):
+    finding = checked(pole, tmp_path, (RESET, RANDOM), NOISY, *LONG, only=["partial-reset"])["partial-reset"]
+    assert finding.severity == "warning"
+    assert "code of the task draws from torch's generator" in finding.message
+
+
+@pytest.mark.parametrize("noise", [(), (NOISY,)], ids=["no noise", "noise"])
+def test_check_rejects_a_reset_that_changes_other_environments_besides_draws(pole, tmp_path, noise):
+    leak = RANDOM + "        self.observed += torch.rand(1, device=self.device)\n"
+    finding = checked(pole, tmp_path, (RESET, leak), *noise, *LONG, only=["partial-reset"])["partial-reset"]
+    assert finding.severity == "error"
+
+
+def test_noise_with_a_bias_starts_anew_at_a_reset_with_a_seed(pole, tmp_path):
+    head = "from isaaclab.utils.noise import GaussianNoiseCfg, NoiseModelWithAdditiveBiasCfg\n"
+    noise = "    observation_noise_model = NoiseModelWithAdditiveBiasCfg("
+    noise += "noise_cfg=GaussianNoiseCfg(std=0.1), bias_noise_cfg=GaussianNoiseCfg(std=0.5))\n"
+    own = ("@configclass\nclass PoleEnvCfg", f"{head}\n@configclass\nclass PoleEnvCfg")
+    found = checked(pole, tmp_path, own, ("    force = 5.0\n", f"    force = 5.0\n{noise}"), *LONG)
+    assert found["same-seed"].severity == "warning"
 
 
 def test_recorded_task_of_a_package_is_named_with_its_id(package):

@@ -10,6 +10,7 @@ from rlcli.errors import TaskError
 from rlcli_isaaclab import triangle_mesh
 from rlcli_isaaclab.namespace import module_of
 from rlcli_isaaclab.sim import SimulationCfg
+from rlcli_isaaclab.utils import assets
 from rlcli_isaaclab.utils.math import matrix_from_quat, quat_from_euler_xyz, random_orientation
 
 
@@ -101,3 +102,14 @@ def test_mesh_without_the_library_trimesh():
         TaskError, match=r"trimesh\.Trimesh\.is_watertight cannot be used: the library is not installed"
     ):
         _ = box.is_watertight
+
+
+def test_local_file_is_read_and_a_missing_one_is_named(tmp_path):
+    file = tmp_path / "gains.bin"
+    file.write_bytes(b"gains")
+    assert assets.read_file(str(file)).read() == b"gains"
+    assert (assets.check_file_path(str(file)), assets.check_file_path("nucleus/robot.usd")) == (1, 2)
+    with pytest.raises(TaskError, match=r"the file '.*other\.bin' does not exist"):
+        assets.read_file(str(tmp_path / "other.bin"))
+    with pytest.raises(TaskError, match="on a server, and rlcli downloads nothing"):
+        assets.read_file(f"{assets.ISAACLAB_NUCLEUS_DIR}/gains.bin")

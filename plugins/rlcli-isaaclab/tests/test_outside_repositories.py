@@ -391,6 +391,35 @@ def test_runner_of_rsl_rl_5_with_its_observation_group(tmp_path):
     assert resolved.agent.critic_obs == ("policy",)
 
 
+RECURRENT = ("RslRlMLPModelCfg, Rsl", "RslRlMLPModelCfg, RslRlRNNModelCfg, Rsl")
+MEMORY = ', activation="elu", rnn_type="lstm", rnn_hidden_dim=6, rnn_num_layers=1'
+
+
+def recurrent_runner(folder, *networks):
+    """Return the rover task with RSL-RL 5's runner in which these networks, of actor and critic, have a memory."""
+    rover(folder, "", [("policy: Policy = Policy()", "actor: Policy = Policy()")])
+    (folder / "agents").mkdir()
+    text = RUNNER.replace(*RECURRENT)
+    for name in networks:
+        start = text.index(f"    {name} = RslRlMLPModelCfg(")
+        text = text[:start] + text[start:].replace("MLPModelCfg", "RNNModelCfg", 1).replace(
+            ', activation="elu"', MEMORY, 1
+        )
+    (folder / "agents" / "rsl_rl_cfg.py").write_text(text)
+    return resolve(find_task(f"{folder / 'rover_env.py'}:RoverEnvCfg"))
+
+
+def test_recurrent_networks_of_rsl_rl_5(tmp_path):
+    memory = recurrent_runner(tmp_path / "rover", "actor", "critic").agent.rnn
+    assert (memory.type, memory.hidden, memory.layers) == ("lstm", 6, 1)
+
+
+def test_recurrent_actor_beside_a_critic_without_memory_is_refused_at_its_line(tmp_path):
+    with pytest.raises(ConfigError, match="the networks of actor and critic differ") as caught:
+        recurrent_runner(tmp_path / "rover", "actor")
+    assert "rsl_rl_cfg.py:" in str(caught.value)
+
+
 GROUPS = """
     @configclass
     class Policy(ObservationGroupCfg):
@@ -640,3 +669,11 @@ def test_package_of_a_repository_with_the_name_of_isaac_labs_tasks(tmp_path, mon
     for file in ("rover.xml", "models.yaml"):
         shutil.copy(own / "rover_of_test" / file, own / "packed" / file)
     resolve(find_task(f"{own / 'packed' / 'rover_env.py'}:RoverEnvCfg"))
+
+
+def test_missing_files_of_isaac_labs_tasks_are_named_with_the_setting(tmp_path, monkeypatch):
+    monkeypatch.delenv("RLCLI_ISAACLAB", raising=False)
+    module = "isaaclab_tasks.manager_based.manipulation.reach.reach_env_cfg"
+    with pytest.raises(TaskError, match="cannot import name 'ReachEnvCfg'") as caught:
+        rover(tmp_path / "rover", f"from {module} import ReachEnvCfg\n")
+    assert "set RLCLI_ISAACLAB to its folder isaaclab/source" in str(caught.value.hint)

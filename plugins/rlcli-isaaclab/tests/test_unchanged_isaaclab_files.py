@@ -188,6 +188,46 @@ def test_direct_task_cannot_read_meshes_of_the_stage_while_its_scene_is_set_up(d
         resolve(find_task(f"{direct}:PoleEnvCfg"))
 
 
+def set_up_with(file, line):
+    """Return the configuration of the direct task whose `_setup_scene` starts with a line of code."""
+    file.write_text(DIRECT.replace("    def _setup_scene(self):\n", f"    def _setup_scene(self):\n        {line}\n"))
+    return resolve(find_task(f"{file}:PoleEnvCfg"))
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "assert self.sim.is_playing() and self.sim.get_physics_dt() == 0.01 and not self.sim.has_gui()",
+        "assert not hasattr(self.sim, 'carb_settings')",
+    ],
+)
+def test_simulation_of_a_direct_task(direct, line):
+    set_up_with(direct, line)
+
+
+def test_stage_of_the_simulation_cannot_be_read_while_the_scene_is_set_up(direct):
+    with pytest.raises(TaskError, match=r"pole_env\.py:\d+: pxr\.Usd\.Prim\.IsValid cannot be used"):
+        set_up_with(direct, 'self.sim.stage.GetPrimAtPath("/World").IsValid()')
+
+
+def test_missing_method_of_the_simulation_is_named_with_its_line(direct):
+    with pytest.raises(TaskError, match=r"env\.sim\.pause cannot be used: .* \(.*pole_env\.py:\d+\)"):
+        set_up_with(direct, "self.sim.pause()")
+
+
+def test_stage_cannot_be_read_after_the_start(direct):
+    read = '        self.sim.stage.GetPrimAtPath("/World/robot")\n'
+    direct.write_text(
+        DIRECT.replace(
+            "    def _pre_physics_step(self, actions):\n", f"    def _pre_physics_step(self, actions):\n{read}"
+        )
+    )
+    env = make_env(resolve(find_task(f"{direct}:PoleEnvCfg")), seed=0)
+    env.reset()
+    with pytest.raises(TaskError, match=r"pole_env\.py:\d+: the USD stage after the start cannot be used"):
+        env.step(torch.zeros(4, 1))
+
+
 def test_direct_task_steps_and_observes_once_per_step(direct):
     env = make_env(resolve(find_task(f"{direct}:PoleEnvCfg")), seed=0)
     obs = env.reset()["policy"]

@@ -149,12 +149,13 @@ SHAPE_SIZES = {
     "sphere": "[radius]",
     "cylinder": "[radius, length]",
     "capsule": "[radius, length], the length without the round ends",
+    "cone": "[radius, length]",
     "plane": "[x, y], the lengths of its edges",
 }
 """Shape -> meaning of its `size` [m]."""
 
 
-_SHAPE_KEYS = ("size", "mass", "density", "free", "mocap")
+_SHAPE_KEYS = ("size", "axis", "mass", "density", "free", "mocap", "collides")
 
 
 class EntityConfig(StrictModel):
@@ -165,11 +166,16 @@ class EntityConfig(StrictModel):
     `cartpole:cartpole.xml`; `package:PACKAGE/FILE` a file of any installed Python package; `models:FILE` a file in a
     folder that the environment variable RLCLI_MODELS lists. ` | ` separates alternatives; the first existing one is
     used."""
-    shape: Literal["box", "sphere", "cylinder", "capsule", "plane"] | None = None
-    """Shape to use instead of a model: a body named `body` with one geom named `geom`."""
+    shape: Literal["box", "sphere", "cylinder", "capsule", "cone", "plane"] | None = None
+    """Shape to use instead of a model: a body named `body` with one geom named `geom`. A cone is a mesh with 32 edges
+    and the volume of the cone; its origin is at half its length, and its tip points along `axis`."""
     size: list[Positive] | None = None
     """Size of a shape [m]: edges [x, y, z] of a box and [x, y] of a plane; [radius] of a sphere; [radius, length] of a
-    cylinder or capsule."""
+    cylinder, capsule or cone."""
+    axis: Literal["x", "y", "z"] = "z"
+    """Axis of a cylinder, capsule or cone in the frame of its body."""
+    collides: bool = True
+    """false: the shape is seen by cameras and rays, but touches nothing."""
     free: bool = False
     """true: the shape moves freely; false: it is fixed at `pos`."""
     mocap: bool = False
@@ -212,7 +218,7 @@ class EntityConfig(StrictModel):
             raise ValueError("an entity has either `model` (an MJCF file) or `shape`: write one of the two")
         if self.shape is not None:
             self._check_shape(self.shape)
-        elif keys := [key for key in _SHAPE_KEYS if getattr(self, key) not in (None, False)]:
+        elif keys := [key for key in _SHAPE_KEYS if getattr(self, key) != type(self).model_fields[key].default]:
             raise ValueError(f"'{keys[0]}' is only allowed with `shape`; remove it and set it in the MJCF of the model")
         return self
 
@@ -224,6 +230,8 @@ class EntityConfig(StrictModel):
             raise ValueError(f"size of a {shape} must be {wanted} [m]; found {found}")
         if self.mass is not None and self.density is not None:
             raise ValueError("mass and density cannot be combined: remove one")
+        if self.axis != "z" and shape not in ("cylinder", "capsule", "cone"):
+            raise ValueError(f"a {shape} has no axis: remove axis, or turn the {shape} with quat")
         if self.free and self.mocap:
             raise ValueError("free and mocap cannot be combined: remove one")
         if shape == "plane" and (self.free or self.mocap):

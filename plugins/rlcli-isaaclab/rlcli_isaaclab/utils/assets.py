@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 from rlcli.errors import TaskError
@@ -31,5 +32,22 @@ def retrieve_file_path(path: str, download_dir: str | None = None, force_downloa
 
 
 def check_file_path(path: str) -> int:
-    """Return 2, which in Isaac Lab means that the file is on a server. rlcli checks models when it reads the scene."""
-    return 2
+    """Return 1 for a local file, else 2, which in Isaac Lab means that the file is on a server.
+
+    2 does not show that the file exists: rlcli checks models when it reads the scene.
+    """
+    return 1 if Path(path).is_file() else 2
+
+
+def read_file(path: str) -> io.BytesIO:
+    """Return the content of a local file.
+
+    Raises:
+        TaskError: if there is no such file.
+    """
+    if Path(path).is_file():
+        return io.BytesIO(Path(path).read_bytes())
+    is_remote = path.startswith(NUCLEUS_ASSET_ROOT_DIR) or "://" in path
+    reason = "is on a server, and rlcli downloads nothing" if is_remote else "does not exist"
+    hint = "download the file yourself, and write its path" if is_remote else "create the file, or write another path"
+    raise TaskError(f"{user_place()}the file '{path}' {reason}", hint=hint)
