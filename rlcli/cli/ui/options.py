@@ -43,7 +43,9 @@ def random_if_minus_one(seed: int) -> int:
 
 
 _TASK = typer.Argument(
-    autocompletion=tasks, metavar="TASK", help="Name of a task, distribution:name, or a folder with a task.yaml."
+    autocompletion=tasks,
+    metavar="TASK",
+    help="Name of a task, distribution:name, or a folder with a task.yaml; with a plugin, PACKAGE:ID or FILE.py:Class.",
 )
 _POLICY_TASK = "Task: its newest run is used, else the policy shipped with the task. Not needed with --checkpoint."
 _OVERRIDES = "Overrides of settings; agent.KEY=VALUE changes the chosen agent."

@@ -121,7 +121,8 @@ class TaskConfig(StrictModel):
     curriculum: dict[str, CurriculumConfig | None] = {}
     """Curriculum terms: changes of the task during training, such as its difficulty."""
     success: dict[str, SuccessConfig | None] = {}
-    """Conditions of success, by name; an episode succeeds if it times out while all of them hold."""
+    """Conditions of success, by name; an episode succeeds if it ends by time-out and each of them held in its last
+    `hold_s` seconds."""
     reward_dt_scaling: bool = True
     """true: rewards of manager-based tasks are multiplied by step_dt, so that returns do not depend on the control
     rate."""
