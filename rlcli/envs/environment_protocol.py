@@ -56,6 +56,7 @@ class Environment(Protocol):
     default_state: dict[str, Tensor]
     """Joint state at the start of episodes, before reset events. qpos (nq,), qvel (nv,)"""
     engine: EngineView
+    """The physics engine, as observers, recorders and reports see it."""
     _playing: bool = True
 
     @property

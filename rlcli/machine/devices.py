@@ -25,13 +25,13 @@ def require_device(device: str) -> None:
     if int(index or 0) >= count:
         found = f"{count} CUDA device{'s' * (count > 1)}" if count else "no CUDA device"
         message = f"device '{device}' is not available: torch {torch.__version__} finds {found}"
-        raise DeviceError(message, hint="use --device cpu")
+        raise DeviceError(message, hint=f"use --device cuda:N with N below {count}" if count else "use --device cpu")
 
 
 def choose_device(wanted: str) -> str:
     """Return the torch device for the value of `--device`: auto, cpu, cuda or cuda:N.
 
-    auto means the GPU if torch and MuJoCo Warp can use it.
+    auto means the GPU if torch finds one and MuJoCo Warp is installed.
 
     Raises:
         UsageError: for any other value.

@@ -110,7 +110,7 @@ class MaskSelection:
         return MaskSelection(self.mask | other.mask, self.seed, self.counters, shared_streams=self.shared_streams)
 
     def stream(self, stream: np.uint64) -> MaskSelection:
-        """Return a selection of the same rows with another random stream, a result of `rlcli.random.stream`."""
+        """Return a selection of the same rows that draws from `stream`, a key of `rlcli.random.stream`."""
         return MaskSelection(self.mask, self.seed, self.counters, stream, self.shared_streams)
 
     def _uniform(self, low: float, high: float, shape: tuple[int, ...]) -> Tensor:

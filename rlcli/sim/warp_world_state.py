@@ -134,8 +134,8 @@ class WarpWorlds:
                 names = [f.name for f in dataclasses.fields(self._data)]
                 if name in names:
                     raise ValueError(
-                        f"field '{name}' of mujoco_warp.Data has no row for each environment; use a field with rows for"
-                        " environments"
+                        f"field '{name}' of mujoco_warp.Data is shared by all environments; use a field with a row for"
+                        " each environment, such as qpos or xpos"
                     )
                 hint = did_you_mean(name, names) or "see mujoco_warp.Data"
                 raise ValueError(f"'{name}' is not a field of MuJoCo Warp's data; {hint}")

@@ -60,7 +60,7 @@ def check_task(
 
     Args:
         task: a name from `list-tasks`, or a folder with a `task.yaml`.
-        agent: name of the agent whose changes to the task and action bound are used; None: the default agent.
+        agent: name of the agent; its action bound and its changes of the task are used; None: the default agent.
         overrides: `key.path=value`, as on the command line.
         config: a further configuration file, like that of `--config`; None: no file.
         num_envs: number of environments, which replaces the task's number; at least 8.

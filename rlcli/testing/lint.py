@@ -43,7 +43,7 @@ def lint_task(
 
     Args:
         task: a name from `list-tasks`, or a folder with a `task.yaml`.
-        agent: name of the agent whose changes to the task, action bound and discount factor are used; None: the
+        agent: name of the agent; its action bound, its discount factor and its changes of the task are used; None: the
             default agent.
         overrides: `key.path=value`, as on the command line.
         config: a further configuration file, like that of `--config`; None: no file.

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 @dataclass(frozen=True, slots=True)
 class Remark:
-    """Finding of a lint rule: a property of a task that makes learning hard."""
+    """Remark of a lint rule: a property of a task that makes learning hard."""
 
     rule: str
     """Name of the rule."""

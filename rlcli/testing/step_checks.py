@@ -87,7 +87,7 @@ def _check_dtype(name: str, value: Tensor, _: tuple[int, ...]) -> Iterator[Findi
         allowed = ["float32", "bool"]
     found = str(value.dtype).removeprefix("torch.")
     if found not in allowed:
-        hint = "end a term with .float() or a comparison; fill buffers in place: buf[:] = ..."
+        hint = "convert the value with .float(), or compare it for a bool; write into buffers in place: buf[:] = ..."
         yield error_at(name, f"the tensor is {found}, expected {' or '.join(allowed)}", hint)
 
 

@@ -176,7 +176,7 @@ class _LibraryRun:
         self._run.log({**metrics, "iteration": iteration}, step=step)
 
     def close(self, state: str) -> None:
-        """Finish the run in the library and wait for pending uploads."""
+        """Finish the run of wandb, as failed unless `state` is `finished`, and wait for pending uploads."""
         self._run.finish()
 
 
@@ -211,7 +211,7 @@ class Wandb(_LibraryRun):
         _drop_links(self._folder)
 
     def close(self, state: str) -> None:
-        """Finish the run in the library and wait for pending uploads."""
+        """Finish the run of wandb, as failed unless `state` is `finished`, and wait for pending uploads."""
         self._run.finish(exit_code=0 if state == "finished" else 1)
         _drop_links(self._folder)
 

@@ -1,4 +1,4 @@
-"""Terms of Isaac Lab that no built-in term of rlcli can replace, written again with Isaac Lab's arguments."""
+"""Own implementations of terms of Isaac Lab, for which rlcli has no built-in term with equal results."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from rlcli_isaaclab.utils.math import quat_apply_inverse, sample_uniform
 
 @dataclass(frozen=True, slots=True)
 class LabTerm:
-    """Term of Isaac Lab that a function or class of this module replaces."""
+    """Implementation of a term of Isaac Lab, and the parameters for which it is used."""
 
     function: Any
     needed: Callable[[Mapping[str, Any]], bool]
-    """Function that receives the term's parameters, and returns whether `function` replaces the built-in term."""
+    """Function that returns whether `function` is used for these parameters; else rlcli's built-in term is."""
 
 
 def last_action_of_term(env: Any, action_name: str) -> Tensor:
@@ -41,7 +41,7 @@ def action_rate_l2_clamped(env: Any) -> Tensor:
 def fingers_contact_force_b(env: Any, contact_sensor_names: list[str], asset_cfg: Any = None) -> Tensor:
     """Return the contact forces that the named sensors measure, robot's root frame. (num_envs, 3 k) [N]
 
-    A sensor with filters counts only contacts with the filtered objects.
+    A sensor with filters counts only contacts with the objects that its filters name.
     """
     robot = env.scene["robot" if asset_cfg is None else asset_cfg.name]
     data = [env.scene.sensors[name].data for name in contact_sensor_names]

@@ -83,9 +83,9 @@ class EventParameters:
         return {} if names is None else {parameter: names}
 
     def sampling(self, operation: str, distribution: str = "uniform") -> TermConfig:
-        """Return the keys `operation` and `distribution` for rlcli's term, from Isaac Lab's parameters.
+        """Return rlcli's keys `operation` and `distribution` with the values of Isaac Lab's parameters.
 
-        The arguments are the values that Isaac Lab uses if the parameters are not set.
+        The arguments are Isaac Lab's defaults, for parameters that the task does not set.
         """
         operation = self.params.get("operation", operation)
         distribution = self.params.get("distribution", distribution)

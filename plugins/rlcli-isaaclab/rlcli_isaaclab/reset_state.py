@@ -57,7 +57,7 @@ def keeps_state(events: Mapping[str, Mapping[str, Any]], scene: SceneReader, ent
 
 
 def note_episode_lengths(env_class: type, report: Report) -> None:
-    """Report the line of `_reset_idx` of a direct task that sets the lengths of new episodes, which has no effect."""
+    """Report as ignored the line of a direct task's `_reset_idx` that sets `episode_length_buf`, the steps so far."""
     for base in env_class.__mro__:
         method = None if is_framework(base.__module__) else vars(base).get("_reset_idx")
         if not inspect.isfunction(method):
@@ -65,5 +65,5 @@ def note_episode_lengths(env_class: type, report: Report) -> None:
         for number, line in enumerate(inspect.getsource(method).splitlines()):
             if _WRITES_LENGTH.search(line.partition("#")[0]):
                 place = f"{inspect.getsourcefile(method)}:{method.__code__.co_firstlineno + number}"
-                why = f"{place}: every episode starts at step 0; the lengths that _reset_idx sets are overwritten"
+                why = f"{place}: every episode starts at step 0; the values that _reset_idx writes are overwritten"
                 report.entries[("_reset_idx", "episode_length_buf")] = ("ignored", why)

@@ -133,7 +133,7 @@ class SceneReader:
             if isinstance(value, AbsentValue) and value.imported_at:
                 file, asset = value.imported_at.rsplit(":", 2)[0], value.__name__
                 message = f"no folder has isaaclab_assets, from which {file} imports {asset}"
-                hint = "unzip it beside isaaclab_tasks, or set RLCLI_ISAACLAB to the folder that has both"
+                hint = "unzip it from Isaac Lab's wheel beside isaaclab_tasks, or set RLCLI_ISAACLAB to their folder"
                 missing.problem((*self.node.key, str(name)), message, hint)
         if missing.problems:
             raise ConfigError(missing.problems)

@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 
 from rlcli.envs.vec_env import VecEnv
-from rlcli.errors import did_you_mean, listing
+from rlcli.errors import TaskError, did_you_mean, listing
 from rlcli.scene.names import NameProblem, match
 from rlcli.sim.rotations import conjugate, multiply, rotate, rotate_inverse
 from rlcli_isaaclab.missing_names import absence, user_place
-from rlcli_isaaclab.sensor_reader import image_name
+from rlcli_isaaclab.sensor_reader import CAMERA_DATA, image_name
 from rlcli_isaaclab.setup_scene import current_setup
 
 
@@ -127,8 +127,11 @@ class _Images(Mapping[str, Tensor]):
 
     def __getitem__(self, name: str) -> Tensor:
         if name not in self._sensors:
-            hint = f"the camera has {listing(self._sensors)}; segmentation and normals have no counterpart"
-            raise absence(f"Camera.data.output[{name!r}]", hint)
+            what, has = f"Camera.data.output[{name!r}]", f"the camera has {listing(self._sensors)}"
+            if name in CAMERA_DATA:
+                message = f"{user_place()}{what}: the camera renders no such images"
+                raise TaskError(message, hint=f"{has}; add {name!r} to its data_types")
+            raise absence(what, f"{has}; segmentation and normals have no counterpart")
         image: Tensor = self._sensors[name].image
         return image
 

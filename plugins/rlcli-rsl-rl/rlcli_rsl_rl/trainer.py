@@ -298,9 +298,9 @@ def _require_batch(env: Environment, config: RunnerConfig) -> None:
     samples = config.num_steps_per_env * env.num_envs // whole
     if samples // parts < 2:
         what = "environments" if whole > 1 else "samples"
-        message = f"{parts} minibatches cannot be made of a rollout of {samples} {what}"
-        at = ("algorithm", "num_mini_batches")
-        raise agent_error(env, at, message, "use more environments, more num_steps_per_env, or fewer minibatches")
+        message = f"{parts} minibatches need at least {2 * parts} {what}, but a rollout has {samples}"
+        more = "more environments" if whole > 1 else "more environments or num_steps_per_env"
+        raise agent_error(env, ("algorithm", "num_mini_batches"), message, f"use {more}, or fewer minibatches")
 
 
 def _settings(env: Environment, config: RunnerConfig, groups: dict[str, list[str]]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Configuration classes of sensors.
+"""Sensors, their configuration classes, and patterns of rays.
 
 A task of Isaac Lab that imports a name from `isaaclab.sensors` gets the object of this name from here.
 """

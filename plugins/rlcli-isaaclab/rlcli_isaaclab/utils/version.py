@@ -1,4 +1,4 @@
-"""Versions of Isaac Lab and Isaac Sim, which task files compare.
+"""The version of Isaac Sim that task files see, and a function that compares versions.
 
 A task of Isaac Lab that imports a name from `isaaclab.utils.version` gets the object of this name from here.
 """
@@ -22,7 +22,9 @@ def get_version() -> tuple[str, ...]:
 
 def get_isaac_sim_version() -> Any:
     """Return the version of Isaac Sim as a `packaging.version.Version`."""
-    from packaging.version import Version  # task files that compare versions import this library themselves
+    from packaging.version import (
+        Version,
+    )  # not a dependency of the plugin: a task file that asks for this also imports it
 
     return Version(_ISAAC_SIM[0])
 
