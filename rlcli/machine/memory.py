@@ -20,11 +20,14 @@ _NO_MEMORY = re.compile(
 )
 """Texts of the errors of MuJoCo, torch, the dynamic linker and Python that mean too little memory; their classes
 differ."""
-_UNDER_A_LIMIT = re.compile(
-    r"failed to load the shared library|framebuffer is not complete|caught an unknown exception", re.IGNORECASE
-)
+_UNDER_A_LIMIT = re.compile(r"failed to load the shared library|framebuffer is not complete", re.IGNORECASE)
 """Texts of errors of Warp and OpenGL that can have several causes. If the process has a memory limit, these errors mean
 too little memory."""
+_IN_LITTLE_MEMORY = re.compile("caught an unknown exception", re.IGNORECASE)
+"""Text of an error of MuJoCo, for a lack of memory and for some mistakes in an MJCF. It means too little memory if the
+memory limit of the process leaves less than `_ENOUGH`."""
+_ENOUGH = 1 << 30
+"""Memory [bytes] that suffices to read any MJCF that is not refused for its size."""
 
 
 def memory_limit(groups: Path = GROUPS, own: Path = OWN_GROUP) -> int | None:
@@ -109,6 +112,13 @@ def resident_memory(report: Path = Path("/proc/self/statm")) -> int | None:
         return None
 
 
+def _used_address_space(report: Path = Path("/proc/self/statm")) -> int:
+    try:
+        return int(report.read_text(encoding="utf-8").split()[0]) * os.sysconf("SC_PAGE_SIZE")
+    except (OSError, ValueError, IndexError, AttributeError):
+        return _NO_LIMIT
+
+
 def memory_error(error: BaseException | None) -> MachineError | None:
     """Return the error to show if an exception, or one of its causes, means too little memory; else None."""
     limit = address_space()
@@ -116,7 +126,12 @@ def memory_error(error: BaseException | None) -> MachineError | None:
     while error is not None:
         text = error_text(error)
         if isinstance(error, MemoryError) or (
-            not isinstance(error, RlcliError) and (_NO_MEMORY.search(text) or (limit and _UNDER_A_LIMIT.search(text)))
+            not isinstance(error, RlcliError)
+            and (
+                _NO_MEMORY.search(text)
+                or (limit and _UNDER_A_LIMIT.search(text))
+                or (limit and _IN_LITTLE_MEMORY.search(text) and limit - _used_address_space() < _ENOUGH)
+            )
         ):
             sizes = "scene.num_envs, or the sizes of networks and histories"
             hint = f"close other programs, raise the limit of the process (`ulimit -v`), or lower {sizes}"

@@ -370,6 +370,11 @@ class _Watch(threading.Thread):
 
     def run(self) -> None:
         """Look at the running code until `end` is called."""
+        # code of a task may replace modules that this thread needs; the command reports this
+        with contextlib.suppress(Exception):
+            self._watch()
+
+    def _watch(self) -> None:
         since: dict[FrameType, float] = {}  # the keys keep the frames alive: a new one cannot get the same identity
         while not self._ended.wait(_SAMPLE_S):
             frames = frames_of_thread(self._watched)

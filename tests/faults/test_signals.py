@@ -212,4 +212,5 @@ def test_signals_at_random_times_print_no_traceback(start, empty_folder, words, 
             time.sleep(random.uniform(0, 1))
             process.send_signal(number)
         assert process.wait(timeout=PATIENCE) in (0, 75, 130, -number)
-        assert "Traceback" not in process.stderr.read()
+        # a signal before Python has loaded rlcli ends Python in its own way
+        assert "rlcli/" not in process.stderr.read().partition("Traceback")[2]

@@ -206,7 +206,7 @@ COMMANDS = [
     ("validate", "{name}"),
     ("validate", "{distribution}:{name}"),
     ("import", "--help"),
-    ("import", "{name}", "x"),
+    ("import", "{name}", "nowhere.yaml"),
     ("import", "{name}", "--help"),
     ("show", "cartpole", "sim"),
     ("terms",),
