@@ -147,7 +147,7 @@ def _agents() -> Iterator[str]:
     yield "on the command line as `agent.KEY=VALUE`. Nested keys have dots:\n"
     yield "<!-- not run: examples of overrides; the tests of the command line train with such -->\n```sh"
     yield "rlcli train cartpole agent.learning_rate=1e-3"
-    yield 'rlcli train cartpole "agent.policy.hidden=[128, 128]"  # trainer: sb3'
+    yield 'rlcli train cartpole "agent.policy.hidden=[128, 128]" --agent sb3-ppo'
     yield 'rlcli train cartpole --agent ppo "agent.actor.hidden=[128, 128]" "agent.critic.hidden=[128, 128]"\n```\n'
     yield "A heading names a trainer and an algorithm: *sb3, ppo* has the settings of `trainer: sb3` with"
     yield "`algorithm: ppo`. Headings such as *sb3, ppo: NetworkConfig* list the keys inside of a key of that type."

@@ -67,7 +67,7 @@ class FormatSpec:
             name `name` that `file` imports, or None.
         libraries: those keys of `aliases` that are general libraries, such as numpy. An import of a library does not
             show that a task file belongs to this format; an import of another key of `aliases` does.
-        api: the `API_VERSION` that the format was written for.
+        api: the version of this interface, `rlcli.task.API_VERSION`, that the format was written for.
     """
 
     summary: str

@@ -24,7 +24,7 @@ class TaskSpec:
         agents: further agents of a configuration in Python: name -> `module:attribute`.
         policies: a folder, relative to the package. Its subfolder `NAME` is the trained policy of the task `NAME`, as
             `rlcli export --format bundle` writes it. Trained policies are optional.
-        api: the `API_VERSION` that the task was written for.
+        api: the version of this interface, `rlcli.task.API_VERSION`, that the task was written for.
     """
 
     package: str

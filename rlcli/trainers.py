@@ -24,7 +24,7 @@ class TrainerSpec:
         refused: name of an algorithm that the trainer's library has, but this trainer cannot run -> the reason.
         parallel: whether several processes can train one policy (`rlcli.rl.distributed`).
         gpu: whether the trainer can train on a GPU, with all tensors on the GPU; if not, `--device auto` is the CPU.
-        api: the `API_VERSION` that the trainer was written for.
+        api: the version of this interface, `rlcli.task.API_VERSION`, that the trainer was written for.
     """
 
     summary: str

@@ -38,7 +38,7 @@ def installation_checks() -> list[Check]:
 def metadata_checks() -> list[Check]:
     """Return one broken check for each distribution whose metadata cannot be read."""
     bad = unreadable_distributions()
-    hint = "reinstall this package, or delete the folder of its metadata, which may break other programs too"
+    hint = "reinstall this package, or delete the folder of its metadata; pip and other programs may fail on it, too"
     return [Check(f"metadata of {each.distribution}", "broken", each.reason, hint) for each in bad]
 
 

@@ -127,7 +127,7 @@ def stress(
         sweeps: the parameters that are varied, with their values.
         episodes: number of episodes in each variant.
         worst: number of random variants that are evaluated to find a worse one; 0: none.
-        reference: a policy that is evaluated in the same variants.
+        reference: a policy that is evaluated in the unchanged task and in the variants of `sweeps`; None: none.
 
     Raises:
         UsageError: if the task lacks a parameter.

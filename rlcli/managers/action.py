@@ -37,7 +37,8 @@ class ActionTerm(Protocol):
     """Interface of an action term: a class `Name(env, *, ...)` whose keyword arguments are the term's keys in the YAML.
 
     A term whose command is a scaled and clipped action may have a method `command_map() -> CommandMap`. Exported
-    policies then contain the formula.
+    policies then contain the formula. A term may have `sinks`, the actuator of each column: two terms with the same
+    actuator are an error.
     """
 
     size: int

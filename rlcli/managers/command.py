@@ -215,7 +215,7 @@ class CommandManager(TensorState):
             self._resample(number, selection, _FIRST)
 
     def compute(self, select: Select, running: Tensor) -> None:
-        """Count a step of the resampling timers, resample the commands whose timer has ended, and update all commands.
+        """Advance the resampling timers a step, resample commands whose timer has ended, and update all commands.
 
         Args:
             select: function from a mask to a selection, whose random numbers depend on the current step.

@@ -267,11 +267,11 @@ def frames_of_thread(thread: int | None) -> list[FrameType]:
 
 @contextlib.contextmanager
 def exit_refused() -> Iterator[None]:
-    """Make `os._exit` and `os.abort` errors in the `with` block: a plugin would end the command without a message.
+    """Let `os._exit` and `os.abort` raise an error in the `with` block: a plugin would end the command silently.
 
-    Other processes, such as children that a library forks, still end. Another thread ends the command, with a message
-    if it runs code of a task. A task that calls `os.fork` itself also gets an error: the child would return from the
-    task's code, and continue the command a second time.
+    Other processes, such as children that a library forks, still end. In another thread the call still ends the
+    command, with a message if the thread runs code of a task. A task that calls `os.fork` itself also gets an error:
+    the child would return from the task's code, and continue the command a second time.
     """
     process, thread = os.getpid(), threading.get_ident()
 

@@ -35,8 +35,7 @@ _log = logging.getLogger(__name__)
 SAVE_EVERY_S = 60.0
 """Time between checkpoints without a `save_interval` [s]."""
 LONG_S = 0.1
-"""Duration of an iteration [s] above which a signal can interrupt the next iteration, before which the state is copied.
-"""
+"""If an iteration took longer than this [s], the state is copied before the next one, and a signal can interrupt it."""
 RECENT = 100
 """Number of newest iterations from whose mean duration the remaining time is estimated."""
 DIVERGED_SHARE = 0.01
@@ -195,7 +194,7 @@ class TrainLoop:
 
     @contextlib.contextmanager
     def _interruptible(self, is_long: bool) -> Iterator[None]:
-        """Allow a signal to end a long iteration, which the `with` block does, in the middle.
+        """Allow a signal to interrupt the iteration that the `with` block runs, if it is long.
 
         The trainer's state is copied before the iteration; after a signal or a divergence, this state is saved. A short
         iteration is always finished, because that takes less time than copying the state. On a GPU and with several

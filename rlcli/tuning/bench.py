@@ -180,7 +180,7 @@ class _Training:
 
         Args:
             setting: sizes and threads of the training.
-            alike: whether a training learns equally as with the task's own setting, see `Trained.alike`.
+            alike: whether a training learns as much as with the task's own setting, see `Trained.alike`.
         """
         total = sum(sum(parts.values()) for parts in self.seconds)
         names = dict.fromkeys(name for parts in self.seconds for name in parts)
@@ -430,7 +430,7 @@ def _fastest(rows: list[Trained]) -> Trained:
 
 
 def _describe(setting: Setting) -> str:
-    """Return a setting as text, such as `64 environments, 32 steps, engine threads 4, torch threads 1, workers 0`."""
+    """Return a setting as text, such as `64 environments, 32 steps, engine threads 4, torch threads 1, workers 1`."""
     parts = [f"{setting.num_envs:,} environments"]
     if setting.horizon is not None:
         parts.append(f"{setting.horizon} steps")

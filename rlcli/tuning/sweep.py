@@ -39,7 +39,7 @@ _SETTINGS = "rlcli"
 _LOCATION = "place"
 """Name of the user attribute of a trial that stores the machine and the folder where the trial can be resumed."""
 _SURPLUS = "surplus"
-"""Name of the user attribute of trials to ignore: those beyond `--trials`, which another machine started meanwhile."""
+"""Name of the user attribute of trials to ignore: those beyond `--trials`; another machine began the last one."""
 _ENDED = ("COMPLETE", "PRUNED", "FAIL")
 
 

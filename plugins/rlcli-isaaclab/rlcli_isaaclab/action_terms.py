@@ -144,6 +144,7 @@ class ThrustAction(AffineActionTerm):
         self._thruster_ids = [asset.thruster_names.index(name) for name in names]
         super().__init__(cfg, env, names)
         if cfg.use_default_offset:
+            # as in Isaac Lab, the default offset is the speed of the rotors [1/s], although the action is a thrust [N]
             self._offset = asset.data.default_thruster_rps[:, self._thruster_ids].clone()
 
     def apply_actions(self) -> None:

@@ -78,7 +78,7 @@ class _Loader(strict_yaml.Loader):
         if isinstance(event, yaml.AliasEvent):
             items, height = self._extents.get(anchor, (0, 0))
             if anchor in self.anchors and not height:
-                raise _error(f"the anchor '{anchor}' contains itself; write the value again", mark)
+                raise _error(f"the anchor '{anchor}' contains the alias *{anchor}; replace the alias by a value", mark)
             self._require(self._items + items, self._depth + height, mark)
             return super().compose_node(parent, index)
         first, before = self._items, self._deepest

@@ -17,8 +17,8 @@ def fit_groups(
 ) -> None:
     """Set the keys `critic_obs` and `task` of an agent, so that its networks read the groups of `obs_groups`.
 
-    rlcli's actor reads only the group `policy`. If `obs_groups` gives the actor other groups as well, their terms are
-    added to `policy`.
+    rlcli's actor reads only the group `policy`. If `obs_groups` gives the actor other groups, their terms are added to
+    `policy`; without `policy` among them, its own terms are removed.
 
     Args:
         sets: `obs_groups`: `policy` (or `actor`) and `critic` -> names of groups.

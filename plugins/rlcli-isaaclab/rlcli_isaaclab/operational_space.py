@@ -26,7 +26,9 @@ _GAINS = {"fixed": 0, "variable_kp": 6, "variable": 12}
 
 
 class OperationalSpaceController:
-    """Controller of the pose and the contact wrench of a frame, all in the frame of the robot's root.
+    """Controller of the pose and the contact wrench of a frame.
+
+    States and efforts are in the frame of the robot's root, targets and gains in the task frame.
 
     Commanded force (Khatib 1987): F = Lambda (Kp e - Kd v), with e the pose error, v the frame's velocity, Kd = 2
     sqrt(Kp) x damping ratio and Lambda = (J M^-1 J^T)^-1 with inertial decoupling, else 1. Efforts: J^T S F, with S the

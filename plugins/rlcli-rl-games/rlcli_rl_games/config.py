@@ -37,7 +37,7 @@ IGNORED: Mapping[str, str] = {
     "player": "use rlcli play",
     "games_to_track": "rlcli averages over at least 100 episodes",
     "max_frames": "use --max-steps",
-    "seq_length": "sequences of recurrent networks are whole rollouts",
+    "seq_length": "this trainer has no recurrent networks",
     "num_seed_steps": "rl_games itself does not read it",
 }
 """Key of `params.config` that has no effect -> reason."""

@@ -1,8 +1,9 @@
 """Runs an exported policy on its robot in MuJoCo: `python run_policy.py [STEPS]`. Needs numpy, mujoco, onnxruntime.
 
 On a robot use `Controller`: call `reset` before an episode, then `act` every `step_dt` seconds. `data` has the fields
-that formulas read (qpos, qvel, ...; SI units, quaternions w x y z, joints at the addresses in `deployment.joints`).
-`inputs` are `command/NAME`, and `observation/NAME` without formula. Controls have the order of `deployment.actuators`.
+that formulas read (qpos, qvel, ...; SI units, quaternions w x y z), at the addresses in `deployment.joints` of the
+policy's metadata. `inputs` maps `command/NAME` to each command, and `observation/NAME` to each observation without a
+formula. Controls have the order of `deployment.actuators`.
 """
 
 import json
