@@ -1,9 +1,8 @@
 """Runs an exported policy on its robot in MuJoCo: `python run_policy.py [STEPS]`. Needs numpy, mujoco, onnxruntime.
 
-On a robot use `Controller`: call `reset` before an episode, then `act` every `step_dt` seconds. `data` has the fields
-that formulas read (qpos, qvel, ...; SI units, quaternions w x y z), at the addresses in `deployment.joints` of the
-policy's metadata. `inputs` maps `command/NAME` to each command, and `observation/NAME` to each observation without a
-formula. Controls have the order of `deployment.actuators`.
+On a robot use `Controller`: `reset` before an episode, then `act` every `step_dt` s. `data` has fields that formulas
+read (qpos, qvel, ...; SI units, quaternions w x y z), as `deployment.joints` in the metadata says. `inputs` maps
+`command/NAME` and `observation/NAME` (without a formula) to values; controls are in the order `deployment.actuators`.
 """
 
 import json
