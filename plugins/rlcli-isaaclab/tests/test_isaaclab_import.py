@@ -179,7 +179,7 @@ BOMB = "a: &a [1, 2, 3, 4, 5, 6, 7, 8, 9]\n" + "".join(
         (BOMB, "env.yaml:5:12: the file has more than 20000 items"),
         ("x: " + "[" * 3000, "env.yaml:1:36: values are nested deeper than 32 levels"),
         ("x: &a [" + "[" * 20 + "1" + "]" * 20 + "]\ny: " + "[" * 20 + "*a", "env.yaml:2:24: values are nested deeper"),
-        ("x: &a [*a]", "env.yaml:1:8: the anchor 'a' contains itself"),
+        ("x: &a [*a]", "env.yaml:1:8: the anchor 'a' contains the alias *a"),
         ("x: '" + "y" * 300_000 + "'", "env.yaml: cannot be read: the file is larger than 262144 bytes"),
         ("x: '" + "y" * 20_000 + "'", "env.yaml:1:4: the value is longer than 16384 characters"),
         ("x: 1\nx: 2", "env.yaml:2:1: duplicate key 'x'"),
