@@ -127,15 +127,33 @@ def main(arguments: list[str] | None = None) -> int:
     """
     print_log_records()
     console.owns_process = arguments is None
-    if console.owns_process:
-        # the library GLFW in MuJoCo starts a Python process, which otherwise imports from this folder
-        os.environ.setdefault("PYTHONSAFEPATH", "1")
-        raise_on_signals()
-        delay_garbage_collection()
-        if hasattr(signal, "SIGALRM"):
-            signal.signal(signal.SIGALRM, _on_alarm)
-        sys.meta_path[:0] = [AddressSpaceCheck, MatplotlibFinder]
-    arguments = sys.argv[1:] if arguments is None else arguments
+    try:
+        if console.owns_process:
+            _set_up_process()
+        code = _main(sys.argv[1:] if arguments is None else arguments)
+        end_on_signals()
+    except KeyboardInterrupt:  # before or after the command
+        failure = stopped_by_signal()
+        if failure is None:
+            raise
+        console.error(failure)
+        code = failure.exit_code
+        end_on_signals()
+    return code
+
+
+def _set_up_process() -> None:
+    """Set signal handlers and import hooks of a process that runs only this command."""
+    # the library GLFW in MuJoCo starts a Python process, which otherwise imports from this folder
+    os.environ.setdefault("PYTHONSAFEPATH", "1")
+    raise_on_signals()
+    delay_garbage_collection()
+    if hasattr(signal, "SIGALRM"):
+        signal.signal(signal.SIGALRM, _on_alarm)
+    sys.meta_path[:0] = [AddressSpaceCheck, MatplotlibFinder]
+
+
+def _main(arguments: list[str]) -> int:
     if not {"COMP_WORDS", "_TYPER_COMPLETE_ARGS"}.intersection(os.environ) and "complete_" in os.environ.get(
         _COMPLETION_VARIABLE, ""
     ):
@@ -143,19 +161,11 @@ def main(arguments: list[str] | None = None) -> int:
     remember_given([*arguments, *(value for name, value in os.environ.items() if name.startswith("RLCLI_"))])
     console.json, console.debug = "--json" in arguments, "--debug" in arguments
     console.has_document = False  # an earlier command of this process may have printed one
-    try:
-        with console.stdout_kept(), malformed_metadata_ignored(), exit_refused(), observe_task_code():
-            code = _run(_with_values(arguments))
-        _flush_output()
-        if console.owns_process:
-            report_lasting_threads()
-    except KeyboardInterrupt:  # before or after the command
-        failure = stopped_by_signal()
-        if failure is None:
-            raise
-        console.error(failure)
-        code = failure.exit_code
-    end_on_signals()
+    with console.stdout_kept(), malformed_metadata_ignored(), exit_refused(), observe_task_code():
+        code = _run(_with_values(arguments))
+    _flush_output()
+    if console.owns_process:
+        report_lasting_threads()
     return code
 
 

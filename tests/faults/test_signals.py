@@ -209,8 +209,7 @@ def test_signals_at_random_times_print_no_traceback(start, empty_folder, words, 
     for _ in range(amount(2, 10, 40)):
         process = start(*words)
         for _ in range(random.choice([1, 2, 3])):
-            time.sleep(random.uniform(0, 1))
+            time.sleep(random.uniform(0.1, 1))  # before it has loaded rlcli, Python prints a traceback of its own
             process.send_signal(number)
-        assert process.wait(timeout=PATIENCE) in (0, 75, 130, -number, -signal.SIGINT)  # the second signal interrupts
-        # a signal before Python has loaded rlcli ends Python in its own way
-        assert "rlcli/" not in process.stderr.read().partition("Traceback")[2]
+        assert process.wait(timeout=PATIENCE) in (0, 75, 130, -number)
+        assert "Traceback" not in process.stderr.read()
