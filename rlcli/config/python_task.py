@@ -27,8 +27,14 @@ from rlcli.config.strict_yaml import Path
 from rlcli.config.term_signatures import SECTIONS, Signature, SignatureError, builtin_terms, signature_of, snake_case
 from rlcli.errors import ConfigError, Problem, RlcliError, TaskError, did_you_mean, listing, short_error
 from rlcli.formats import Note
-from rlcli.registry import TaskSource, import_file, is_framework, load_module, load_object
-from rlcli.registry.failed_imports import FailedImport, error_location, report_failures, take_failures
+from rlcli.registry import TaskSource, import_file, is_framework, load_object
+from rlcli.registry.failed_imports import (
+    error_location,
+    missing_module_hint,
+    registered_object,
+    report_failures,
+    take_failures,
+)
 from rlcli.registry.formats import Format, first_result, format_of_module, require_module
 from rlcli.registry.module_names import with_own_names
 from rlcli.registry.task_imports import CONFIGURATION, ENVIRONMENT, files_that_register, registrations
@@ -105,8 +111,10 @@ def load(
         raise
     except Exception as error:
         require_module(error)
-        message = f"{source.python}: {with_own_names(short_error(error))}{error_location(error)}"
-        raise TaskError(message, hint=_hint(error)) from error
+        importing = str(source.root) if isinstance(error, ModuleNotFoundError) else ""
+        message = f"{source.python}: {with_own_names(short_error(error))}{error_location(error, importing)}"
+        hint = first_result("hint", error) or missing_module_hint(error, source.root, source.python.rpartition(":")[2])
+        raise TaskError(message, hint=hint) from error
     return task
 
 
@@ -249,7 +257,7 @@ def _import_configuration(source: TaskSource) -> tuple[Any, dict[str, Any]]:
     module = import_file(FilePath(file))
     if not hasattr(module, attribute.partition(".")[0]) and attribute in registrations:
         uses = [registrations[attribute]]
-        return _with_environment(_object(uses[0][CONFIGURATION]), uses[0]), _registered_agents(uses[0])
+        return _with_environment(registered_object(uses[0][CONFIGURATION]), uses[0]), _registered_agents(uses[0])
     value: Any = module
     for part in attribute.split("."):
         if not hasattr(value, part):
@@ -312,7 +320,7 @@ def _registered(source: TaskSource) -> tuple[Any, dict[str, Any]]:
         hint = f"name one: {listing(f'{source.root}:{name}' for name in found)}" if found else None
         raise TaskError(f"{source.root} registers {len(found)} tasks with {CONFIGURATION}, expected 1", hint=hint)
     kwargs = found[wanted or next(iter(found))]
-    return _with_environment(_object(kwargs[CONFIGURATION]), kwargs), _registered_agents(kwargs)
+    return _with_environment(registered_object(kwargs[CONFIGURATION]), kwargs), _registered_agents(kwargs)
 
 
 def _with_environment(value: Any, kwargs: Mapping[str, Any]) -> Any:
@@ -343,7 +351,7 @@ def _agent_object(entry: object) -> Any:
     If a library that the settings import is not installed, return the error: another agent may be used.
     """
     try:
-        return _object(entry)
+        return registered_object(entry)
     except ModuleNotFoundError as error:
         return error
 
@@ -364,22 +372,6 @@ def _is_entry(entry: object, module: str, attribute: str) -> bool:
 
 def _module_of(entry: object) -> str:
     return entry.partition(":")[0] if isinstance(entry, str) else str(getattr(entry, "__module__", ""))
-
-
-def _object(entry: object) -> Any:
-    """Return the object that an argument of a registration with Gymnasium refers to.
-
-    For `module:name` this is the imported object, and for `module:file.yaml` the path of the file. An argument that is
-    not a string is returned unchanged.
-    """
-    if isinstance(entry, FailedImport):
-        return entry()  # raises the error of the import
-    if not isinstance(entry, str):
-        return entry
-    if not entry.endswith((".yaml", ".yml", ".json")):
-        return load_object(entry)
-    module, _, file = entry.rpartition(":")
-    return FilePath(str(load_module(module).__file__)).parent / file if module else FilePath(file)
 
 
 def _add_agents(task: PythonTask, agents: Mapping[str, Any]) -> None:
@@ -441,9 +433,3 @@ def _read_agent(task: PythonTask, name: str, agent: object) -> dict[str, Any] | 
 @functools.cache
 def _report_choice(message: str) -> None:
     _log.info(message)
-
-
-def _hint(error: BaseException) -> str | None:
-    """Return the hint that the plugin of another framework's format has for an error; None if there is no hint."""
-    hint: str | None = first_result("hint", error)
-    return hint

@@ -61,6 +61,11 @@ class Asset:
         self.root_physx_view = self._physics_sim_view = PhysxView(env, entity)
 
     @property
+    def _data(self) -> Data:
+        """Isaac Lab's private name of `data`, which tasks read too."""
+        return self.data
+
+    @property
     def permanent_wrench_composer(self) -> BodyWrench:
         """Writer of forces and torques on bodies. They act in every physics step until they are changed."""
         return self._wrench

@@ -10,6 +10,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+import torch
+
 from rlcli.errors import ConfigError, Problem
 from rlcli.formats import Note, Status
 from rlcli_isaaclab.config_class import is_missing
@@ -100,10 +103,13 @@ class Node:
         return value is not None and not is_missing(value)
 
     def get(self, name: str, default: Any = None) -> Any:
-        """Return the value of a key and mark the key as mapped; return `default` if the value is None or missing."""
+        """Return the value of a key and mark the key as mapped; return `default` if the value is None or missing.
+
+        An array or a tensor is returned as lists of numbers.
+        """
         if name in self.data:
             self.report.entries.setdefault((*self.key, name), ("mapped", ""))
-        value = self.data.get(name)
+        value = _without_array(self.data.get(name))
         return default if value is None or is_missing(value) else value
 
     def require(self, name: str) -> Any:
@@ -173,8 +179,17 @@ _FACADES = {
 """Class that stands for two of Isaac Lab's -> (a setting, Isaac Lab's class with the setting, the one without it)."""
 
 
+def _without_array(value: Any) -> Any:
+    """Return an array or a tensor as lists of numbers, and any other value unchanged."""
+    return value.tolist() if isinstance(value, np.ndarray | np.generic | torch.Tensor) else value
+
+
 def to_plain(value: Any) -> Any:
-    """Return a setting in a form that a YAML task can hold: tuples become lists, and infinities become +-1e9."""
+    """Return a setting in a form that a YAML task can hold.
+
+    Arrays, tensors and tuples become lists, and infinities become +-1e9.
+    """
+    value = _without_array(value)
     if isinstance(value, Mapping):
         return {str(key): to_plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -193,13 +208,15 @@ def is_empty(value: Any) -> bool:
     """Return whether a setting is None, missing, False, "" or an empty list, or a dict that has only such values."""
     if isinstance(value, Mapping):
         return all(is_empty(item) for item in value.values())
+    value = _without_array(value)
     return (
         value is None or is_missing(value) or value is False or value in ("", slice(None)) or value == [] or value == ()
     )
 
 
 def equals_default(value: Any, default: Any) -> bool:
-    """Return whether a setting equals its default. A list and a tuple with equal items are equal."""
+    """Return whether a setting equals its default. A list, a tuple and an array with equal items are equal."""
+    value, default = _without_array(value), _without_array(default)
     if isinstance(value, list | tuple) and isinstance(default, list | tuple):
         return len(value) == len(default) and all(equals_default(a, b) for a, b in zip(value, default, strict=True))
     return bool(value == default)

@@ -192,7 +192,7 @@ def collect(data: Any) -> dict[str, dict[str, list[str]]]:
                     add(value["asset_name"], "body", value.get(key))
             for pair in value.get("synced_feet_pair_names") or ():  # the gait reward of Isaac Lab's Spot
                 add("robot", "body", pair)
-            for key in ("open_command_expr", "close_command_expr"):
+            for key in ("open_command_expr", "close_command_expr", "scale", "offset"):
                 if isinstance(value.get(key), Mapping):
                     add(value.get("asset_name"), "joint", list(value[key]))
             for item in value.values():
@@ -248,7 +248,7 @@ def mjcf(
         or ("base" if joints else (bodies or [name])[0])
     )
     rest = [b for b in bodies if b != root]
-    owned = {joint: (rest.pop(0) if rest else f"of_{joint}_moved") for joint in joints}
+    owned = {joint: (rest.pop(0) if rest else f"part_{number}") for number, joint in enumerate(joints)}
     fixed = "".join(
         f'<body name="{b}" pos="{0.1 * (i % 5)} {0.1 * (i // 5)} -0.1"><geom size="0.02" mass="0.05"/></body>'
         for i, b in enumerate(rest)

@@ -677,3 +677,39 @@ def test_missing_files_of_isaac_labs_tasks_are_named_with_the_setting(tmp_path, 
     with pytest.raises(TaskError, match="cannot import name 'ReachEnvCfg'") as caught:
         rover(tmp_path / "rover", f"from {module} import ReachEnvCfg\n")
     assert "set RLCLI_ISAACLAB to its folder isaaclab/source" in str(caught.value.hint)
+
+
+def test_settings_that_are_arrays(tmp_path):
+    lines = "import numpy\n\nHEIGHT = numpy.array((0.0, 0.0, 0.7))\nAXES = torch.eye(3)\n"
+    spawn = 'spawn=sim_utils.UsdFileCfg(usd_path="omniverse://somewhere/rover.usd"),'
+    state = "init_state=ArticulationCfg.InitialStateCfg(pos=HEIGHT),"
+    replaced = [(spawn, f"{spawn} {state}"), ("events: Events", "shape = HEIGHT\n    axes = AXES\n    events: Events")]
+    resolved = rover(tmp_path / "rover", lines, replaced)
+    assert resolved.task.scene.entities["robot"].pos == pytest.approx((0.0, 0.0, 0.7))
+    ignored = [note.key for note in resolved.notes if note.status == "ignored"]
+    assert {"shape", "axes"} <= set(ignored)
+
+
+def test_registered_module_that_does_not_exist_is_named_with_the_registering_file(tmp_path):
+    package = write(tmp_path / "carts")
+    start = package / "__init__.py"
+    more = "'Pond-v0', entry_point='x', kwargs={'env_cfg_entry_point': f'{__name__}.pond_cfg:PondCfg'}"
+    start.write_text(f"{start.read_text()}\ngym.register({more})\n")
+    with pytest.raises(TaskError, match=r"No module named 'carts\.pond_cfg'") as caught:
+        resolve(find_task(f"{package}:Pond-v0"))
+    assert caught.value.hint == f"{start} registers the task with this module; correct the module's name"
+
+
+def test_registered_module_below_a_folder_that_is_no_package_needs_pythonpath(tmp_path, monkeypatch):
+    package = write(tmp_path / "farm" / "carts")
+    start = package / "__init__.py"
+    more = "'Lake-v0', entry_point='x', kwargs={'env_cfg_entry_point': 'farm.carts.lake_cfg:LakeCfg'}"
+    start.write_text(f"{start.read_text()}\ngym.register({more})\n")
+    with pytest.raises(TaskError, match=r"No module named 'farm'") as caught:
+        resolve(find_task(f"{package}:Lake-v0"))
+    assert caught.value.hint == f"farm is a folder in {tmp_path}: set PYTHONPATH={tmp_path}"
+
+
+def test_private_name_of_an_assets_data(tmp_path):
+    code = "def speed(env):\n    robot = env.scene['robot']\n    return robot._data.joint_vel.abs().sum(dim=1)\n"
+    stepped(rover(tmp_path / "rover", code, rewards={"speed": "RewardTermCfg(func=speed, weight=1.0)"}))
