@@ -294,7 +294,9 @@ def _environment_class(cfg: Any) -> type[DirectRLEnv]:
             raise ConfigError([Problem("configuration", "", what, hint)])
         found = kinds[0]
     if not (isinstance(found, type) and issubclass(found, DirectRLEnv)):
-        raise ConfigError([Problem("configuration", "", f"{entry} is not a DirectRLEnv", "derive it from DirectRLEnv")])
+        raise ConfigError(
+            [Problem("configuration", "", f"{entry} is not a class derived from DirectRLEnv", "register such a class")]
+        )
     return found
 
 

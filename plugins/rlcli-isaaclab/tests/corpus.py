@@ -79,7 +79,8 @@ def run(
 
         torch.set_num_threads(1)
         entry = kwargs["env_cfg_entry_point"]
-        value = (load_object(entry) if isinstance(entry, str) else entry)()
+        value = load_object(entry) if isinstance(entry, str) else entry
+        value = value() if callable(value) else value
         stage = 1
         if last == "imports":
             return stage, "", facts
