@@ -64,6 +64,7 @@ class Robot:
         home = default_pose(spec)
         self.has_pose = home is not None
         """Whether the file has a default pose. If not, joints are at zero, or beside zero where a limit is near it."""
+        has_pgs = spec.option.solver == mujoco.mjtSolver.mjSOL_PGS
         without_actuator = remove_scene_elements(spec)
         original = spec.compile()
         tree = ElementTree.fromstring(spec.to_xml())
@@ -93,7 +94,10 @@ class Robot:
         self.actuator = {int(model.actuator_trnid[a, 0]): a for a in range(model.nu) if joint_actuator[a]}
         names = [self.name(j) for j in self.joints]
         self.doubts = [(message, hint) for message, hint, _ in doubtful_limits(model, self.joints, names)]
-        """(message, hint) for each property of the file that is probably an error."""
+        """(message, hint) for each property of the file that is probably an error, or that the copy replaces."""
+        if has_pgs:
+            hint = 'for the file\'s solver, which runs on a CPU only, write solver="PGS" into its <option>'
+            self.doubts.append(("the copy of the model has the solver Newton instead of PGS", hint))
         self.data = mujoco.MjData(model)
         for joint in self.joints:
             if home is not None and len(home) == model.nq:

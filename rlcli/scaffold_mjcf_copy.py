@@ -43,7 +43,8 @@ def remove_scene_elements(spec: mujoco.MjSpec) -> list[str]:
     would hold the robot. If as many joints are pulled by tendons as have an actuator of their own, the actuators of
     tendons and their sensors are removed. So are servos with dynamics of their own, such as a filter. The task drives
     these joints directly. If a flag turns gravity off, gravity 0 replaces the flag: the flag would override the gravity
-    of the task. `spec` is changed in place.
+    of the task. The solver PGS, which the GPU engine does not support, is replaced by Newton. `spec` is changed in
+    place.
 
     Returns:
         Names of the joints that have lost their actuators. The list is empty if the robot has no other actuator: then
@@ -52,6 +53,8 @@ def remove_scene_elements(spec: mujoco.MjSpec) -> list[str]:
     if spec.option.disableflags & _NO_GRAVITY:
         spec.option.disableflags &= ~_NO_GRAVITY
         spec.option.gravity = [0.0, 0.0, 0.0]
+    if spec.option.solver == mujoco.mjtSolver.mjSOL_PGS:
+        spec.option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     lost = [*_remove_tendon_actuators(spec), *_remove_unknown_servos(spec)]
     for key in list(spec.keys):
         spec.delete(key)

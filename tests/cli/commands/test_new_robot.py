@@ -319,6 +319,14 @@ def test_gravity_that_a_flag_turns_off_can_be_set_in_the_task(cli, tmp_path):
         assert (float(env.engine.field("qpos")[0, 2]) < start - 0.01) == falls
 
 
+def test_solver_that_the_gpu_engine_lacks_is_replaced(cli, tmp_path):
+    result, _ = written(cli, tmp_path, DOG.replace("<worldbody>", '<option solver="PGS"/><worldbody>'))
+    assert "the copy of the model has the solver Newton instead of PGS" in result.err
+    env = make("my-robot/my_robot", num_envs=2, overrides=["sim.engine=warp"])
+    env.reset()
+    assert bool(env.step(torch.zeros(2, 4)).reward.isfinite().all())
+
+
 def test_robot_without_collisions_stands_on_the_ground_in_its_default_pose(cli, tmp_path):
     _, task = written(cli, tmp_path, DOG.replace("<geom ", '<geom contype="0" conaffinity="0" '))
     assert task["scene"]["entities"]["robot"]["pos"][2] == pytest.approx(0.2205, abs=1e-3)
