@@ -28,16 +28,17 @@ from rlcli.config.term_signatures import SECTIONS, Signature, SignatureError, bu
 from rlcli.errors import ConfigError, Problem, RlcliError, TaskError, did_you_mean, listing, short_error
 from rlcli.formats import Note
 from rlcli.registry import TaskSource, import_file, is_framework, load_object
-from rlcli.registry.failed_imports import (
-    error_location,
-    missing_module_hint,
-    registered_object,
-    report_failures,
-    take_failures,
-)
+from rlcli.registry.failed_imports import error_location, report_failures, take_failures
 from rlcli.registry.formats import Format, first_result, format_of_module, require_module
 from rlcli.registry.module_names import with_own_names
-from rlcli.registry.task_imports import CONFIGURATION, ENVIRONMENT, files_that_register, registrations
+from rlcli.registry.task_imports import (
+    CONFIGURATION,
+    ENVIRONMENT,
+    files_that_register,
+    missing_module_hint,
+    registered_object,
+    registrations,
+)
 
 _log = logging.getLogger(__name__)
 _OWN = "rlcli.mdp."

@@ -15,6 +15,7 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
+from rlcli.config.docstrings import describe
 from rlcli.config.strict_yaml import YamlError, load
 from rlcli.config.term_signatures import SECTIONS, SELECTORS, Parameter, Signature, Vocabulary, builtin_terms
 
@@ -97,6 +98,22 @@ def term_entries(pattern: str = "", term_files: Iterable[Path] = ()) -> list[Ter
     if any(sign in text for sign in "*?["):
         return [entry for entry in entries if fnmatchcase(entry.name.lower(), text)]
     return [entry for entry in entries if text in f"{entry.name} {entry.section} {entry.summary}".lower()]
+
+
+@functools.cache
+def section_keys(section: str) -> tuple[KeyEntry, ...]:
+    """Return the optional keys that every term of a section has, such as `delay` of observations and actions."""
+    model = SECTIONS[section]
+    schema = model.model_json_schema()
+    describe(schema, model)
+    mappings = {name: "{" + ", ".join(part["properties"]) + "}" for name, part in schema.get("$defs", {}).items()}
+    found = []
+    for name, value in schema["properties"].items():
+        if name not in ("func", "params", *schema.get("required", ())):
+            type_ = re.sub(r"\w+", lambda word: mappings.get(word[0], word[0]), type_text(value))
+            meaning = " ".join(value.get("description", "").split())
+            found.append(KeyEntry(name, type_, False, value.get("default"), meaning))
+    return tuple(found)
 
 
 def type_text(schema: Mapping[str, Any]) -> str:

@@ -5,7 +5,6 @@ With placeholders, the other tasks of the package can be used. Any use of a plac
 
 import importlib
 import logging
-import sys
 import sysconfig
 import traceback
 from pathlib import Path
@@ -13,7 +12,6 @@ from typing import Any
 
 from rlcli.registry.formats import is_framework
 from rlcli.registry.module_names import with_own_names
-from rlcli.registry.task_imports import files_that_register, load_module, load_object
 
 _log = logging.getLogger(__name__)
 _failures: dict[str, Exception] = {}
@@ -110,36 +108,3 @@ def error_location(error: BaseException, importing: str = "") -> str:
     other = [frame for frame in frames if not frame[2]] or frames
     own = [frame for frame in other if not frame[0].startswith(_LIBRARIES)] or other
     return f" ({own[-1][0]}:{own[-1][1]})" if own else ""
-
-
-def registered_object(entry: object) -> Any:
-    """Return the object that an argument of a registration with Gymnasium refers to.
-
-    For `module:name` this is the imported object, and for `module:file.yaml` the path of the file. An argument that is
-    not a string is returned unchanged.
-    """
-    if isinstance(entry, FailedImport):
-        return entry()  # raises the error of the import
-    if not isinstance(entry, str):
-        return entry
-    if not entry.endswith((".yaml", ".yml", ".json")):
-        return load_object(entry)
-    module, _, file = entry.rpartition(":")
-    return Path(str(load_module(module).__file__)).parent / file if module else Path(file)
-
-
-def missing_module_hint(error: BaseException, package: Path, task: str) -> str | None:
-    """Return what to do about a module of the user that was not found; None for other errors and for other modules.
-
-    Args:
-        error: the error of the import.
-        package: the package, a folder, that registers the task.
-        task: the ID of the task.
-    """
-    name = str(error.name) if isinstance(error, ModuleNotFoundError) else ""
-    top = name.partition(".")[0]
-    if top and top == package.name:
-        files = files_that_register(package, task)
-        return f"{files[0]} registers the task with this module; correct the module's name" if files else None
-    above = next((folder.parent for folder in package.parents if top and folder.name == top), None)
-    return f"{top} is a folder in {above}: set PYTHONPATH={above}" if above and str(above) not in sys.path else None

@@ -14,6 +14,7 @@ from importlib.machinery import ModuleSpec
 from pathlib import Path
 from typing import Any
 
+from rlcli.registry.failed_imports import FailedImport
 from rlcli.registry.framework_imports import (
     TaskFileLoader,
     files_below,
@@ -68,6 +69,39 @@ def load_module(name: str) -> Any:
                 raise
             _imported[file.resolve(), load_module.__name__] = None
         return sys.modules[alias]
+
+
+def registered_object(entry: object) -> Any:
+    """Return the object that an argument of a registration with Gymnasium refers to.
+
+    For `module:name` this is the imported object, and for `module:file.yaml` the path of the file. An argument that is
+    not a string is returned unchanged.
+    """
+    if isinstance(entry, FailedImport):
+        return entry()  # raises the error of the import
+    if not isinstance(entry, str):
+        return entry
+    if not entry.endswith((".yaml", ".yml", ".json")):
+        return load_object(entry)
+    module, _, file = entry.rpartition(":")
+    return Path(str(load_module(module).__file__)).parent / file if module else Path(file)
+
+
+def missing_module_hint(error: BaseException, package: Path, task: str) -> str | None:
+    """Return what to do about a module of the user that was not found; None for other errors and for other modules.
+
+    Args:
+        error: the error of the import.
+        package: the package, a folder, that registers the task.
+        task: the ID of the task.
+    """
+    name = str(error.name) if isinstance(error, ModuleNotFoundError) else ""
+    top = name.partition(".")[0]
+    if top and top == package.name:
+        files = files_that_register(package, task)
+        return f"{files[0]} registers the task with this module; correct the module's name" if files else None
+    above = next((folder.parent for folder in package.parents if top and folder.name == top), None)
+    return f"{top} is a folder in {above}: set PYTHONPATH={above}" if above and str(above) not in sys.path else None
 
 
 def import_file(file: Path) -> Any:

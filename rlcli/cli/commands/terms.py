@@ -13,7 +13,9 @@ import typer
 from rlcli.cli.ui.console import console
 
 if TYPE_CHECKING:
-    from rlcli.config.term_docs import TermEntry
+    from collections.abc import Sequence
+
+    from rlcli.config.term_docs import KeyEntry, TermEntry
 
 
 def command(
@@ -26,7 +28,8 @@ def command(
     key, with its unit, and an example.
 
     Options:
-        pattern: Text in the name, section or summary of the terms, or a pattern of names such as `root_*`.
+        pattern: Text in the name, section or summary of the terms, the name of a key that all terms of a section have,
+            such as `delay`, or a pattern of names such as `root_*`.
             [default: all terms]
         task: Add the terms of this task.
 
@@ -36,7 +39,8 @@ def command(
         rlcli terms joint_vel_l1
             Describe one term with its keys.
     """
-    from rlcli.config.term_docs import term_entries
+    from rlcli.config.term_docs import section_keys, term_entries
+    from rlcli.config.term_signatures import SECTIONS
     from rlcli.errors import did_you_mean
     from rlcli.registry import find_task
 
@@ -47,7 +51,10 @@ def command(
         _print_details(entry)
     if not exact:
         _print_lines(entries)
-    if not entries:
+    shared = {section: key for section in SECTIONS for key in section_keys(section) if key.name == pattern}
+    for section, key in shared.items():
+        _print_keys(f"key of every term in {section}:", [key])
+    if not entries and not shared:
         near = did_you_mean(pattern or "", [entry.name for entry in term_entries("", term_files)])
         console.info(f"no term's name or summary contains '{pattern}'; {near or 'run `rlcli terms` to list all terms'}")
         if task is None:
@@ -74,13 +81,24 @@ def _signature(entry: TermEntry) -> list[str]:
 
 
 def _print_details(entry: TermEntry) -> None:
-    from rlcli.config.term_docs import yaml_text
+    from rlcli.config.term_docs import section_keys
+    from rlcli.config.term_signatures import SECTIONS
 
     console.data(f"{entry.name} ({entry.section})", entry.summary, "")
+    _print_keys("", entry.keys)
+    shared = [key.name for key in section_keys(entry.section)] if entry.section in SECTIONS else []
+    if shared:
+        console.data("", f"keys of every term in {entry.section}: {', '.join(shared)}")
+    console.data("", f"example: {entry.example}")
+
+
+def _print_keys(title: str, keys: Sequence[KeyEntry]) -> None:
+    from rlcli.config.term_docs import yaml_text
+
     rows = [
-        [key.name, key.type, "required" if key.required else yaml_text(key.default), key.description]
-        for key in entry.keys
+        [key.name, key.type, "required" if key.required else yaml_text(key.default), key.description] for key in keys
     ]
+    if title:
+        console.data(title)
     if rows:
         console.table(["key", "type", "default", "meaning"], rows)
-    console.data("", f"example: {entry.example}")

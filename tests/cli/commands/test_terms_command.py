@@ -49,3 +49,13 @@ def test_terms_suggests_near_names(cli):
     assert "did you mean 'joint_vel_l1'" in done.err
     assert "only with --task: rlcli terms joint_vel_l11 --task TASK" in done.err
     assert "--task" not in cli("terms", "joint_vel_l11", "--task", "cartpole").err
+
+
+def test_keys_of_every_term_of_a_section_are_found_and_named(cli):
+    out = cli("terms", "delay").out
+    for section in ("actions", "observations"):
+        assert f"key of every term in {section}:" in out
+    assert "{steps, seconds, redraw} or null" in out
+    described = cli("terms", "joint_vel_rel").out
+    assert "keys of every term in observations: modifiers, noise, bias, clip, scale, delay, history" in described
+    assert "no term" not in cli("terms", "delay").err
