@@ -191,8 +191,8 @@ _HINTS = {
     27: "files are limited to the size that `ulimit -f` shows: raise this limit, or write smaller files",
     28: "free some space",
     36: "a name in a path has at most 255 bytes: shorten it",
-    13: "choose another folder with --runs-dir",
-    30: "the disk is read-only: make it writable, copy the run, or choose another folder with --runs-dir",
+    13: "choose another path (for runs: --runs-dir FOLDER)",
+    30: "the disk is read-only: make it writable, copy the run, or choose another path (for runs: --runs-dir FOLDER)",
     122: "the disk quota is used up: free some space",
 }
 """Error number of the operating system (errno), such as ENOSPC for a full disk -> hint for the user."""

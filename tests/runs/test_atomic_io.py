@@ -79,10 +79,11 @@ def test_write_atomic_reports_an_error_of_the_temporary_path(tmp_path):
     ("code", "hint"),
     [
         (errno.ENOSPC, "free some space"),
-        (errno.EACCES, "choose another folder with --runs-dir"),
+        (errno.EACCES, "choose another path (for runs: --runs-dir FOLDER)"),
         (
             errno.EROFS,
-            "the disk is read-only: make it writable, copy the run, or choose another folder with --runs-dir",
+            "the disk is read-only: make it writable, copy the run, or choose another path "
+            "(for runs: --runs-dir FOLDER)",
         ),
         (errno.EDQUOT, "the disk quota is used up: free some space"),
         (errno.EIO, None),
