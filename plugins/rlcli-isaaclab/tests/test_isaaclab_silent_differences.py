@@ -142,6 +142,18 @@ def test_disable_gravity_of_a_direct_task_acts_and_other_properties_are_reported
     assert all(notes.values())
 
 
+def test_settings_of_a_urdf_conversion_are_reported_with_reasons(tmp_path):
+    spawn = 'spawn=sim_utils.UsdFileCfg(usd_path="omniverse://somewhere/rover.usd"'
+    urdf = 'spawn=sim_utils.UrdfFileCfg(asset_path="somewhere/rover.urdf", fix_base=%s, merge_fixed_joints=True'
+    reasons = []
+    for fixed in (True, False):
+        resolved = rover(tmp_path / f"rover{fixed}", "", [(spawn, urdf % fixed)])
+        notes = {note.key: note.text for note in resolved.notes if note.status == "ignored"}
+        assert notes["scene.robot.spawn.merge_fixed_joints"] == "the bodies of the MJCF are simulated"
+        reasons.append(notes.get("scene.robot.spawn.fix_base"))
+    assert reasons == ["the MJCF decides: a root body with a free joint moves, without one it is fixed", None]
+
+
 def test_disable_gravity_of_a_manager_based_task_acts(tmp_path):
     spawn = 'usd_path="omniverse://somewhere/rover.usd"'
     lifted = spawn + ", rigid_props=sim_utils.RigidBodyPropertiesCfg(disable_gravity=True)"
