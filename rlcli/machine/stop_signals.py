@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
+import sys
+import threading
 from types import FrameType
+from typing import TYPE_CHECKING
 
 from rlcli.errors import INTERRUPTED, STOPPED, Stopped
 
@@ -13,14 +17,24 @@ STOP_SIGNALS = tuple(
 )
 """Signals from Ctrl-C, from a scheduler such as Slurm (SIGTERM, SIGUSR1), and from a terminal that closes. Windows has
 only some of them."""
+_PAUSE_S = 0.01
+"""Time after which a signal is sent again: the destructor that has swallowed its KeyboardInterrupt has ended [s]."""
 _received: list[int] = []
+
+if TYPE_CHECKING:
+    from sys import UnraisableHookArgs
 
 
 def raise_on_signals() -> None:
-    """Raise KeyboardInterrupt at the first of `STOP_SIGNALS`; signals that the process ignores (nohup) stay ignored."""
+    """Raise KeyboardInterrupt at the first of `STOP_SIGNALS`; signals that the process ignores (nohup) stay ignored.
+
+    Python drops an exception of a destructor (`__del__`) or of a weak reference's callback. If KeyboardInterrupt is
+    dropped in this way, it is raised again later.
+    """
     for number in STOP_SIGNALS:
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _receive)
+    sys.unraisablehook = _on_dropped_exception
 
 
 def end_on_signals() -> None:
@@ -47,3 +61,17 @@ def _receive(number: int, _: FrameType | None) -> None:
         return
     _received.append(number)
     raise KeyboardInterrupt
+
+
+def _on_dropped_exception(found: UnraisableHookArgs) -> None:
+    if not issubclass(found.exc_type, KeyboardInterrupt):
+        sys.__unraisablehook__(found)
+    elif _received:
+        timer = threading.Timer(_PAUSE_S, _send_again)
+        timer.daemon = True
+        with contextlib.suppress(RuntimeError):  # the interpreter is ending
+            timer.start()
+
+
+def _send_again() -> None:
+    os.kill(os.getpid(), _received.pop())

@@ -181,7 +181,7 @@ def observe_task_code() -> Iterator[None]:
         def hook(found: Any) -> None:
             frames = [each for each in traceback.walk_tb(found.exc_traceback) if is_task_code(each[0])]
             place = _place(*frames[-1]) if frames else place_in_task(sys._getframe(1))
-            if found.exc_value is None or place is None:
+            if found.exc_value is None or place is None or isinstance(found.exc_value, KeyboardInterrupt):
                 other(found)
             # SystemExit in a thread only ends this thread
             elif not (isinstance(found.exc_value, SystemExit) and hasattr(found, "thread")):
