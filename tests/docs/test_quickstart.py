@@ -2,7 +2,6 @@
 
 import os
 import re
-import shutil
 import subprocess
 import sys
 
@@ -10,8 +9,7 @@ import pytest
 from support.consoles import Command, commands, difference
 from support.empty_environment import make, requirements_of_rlcli
 from support.fenced import REPOSITORY, page_path
-
-LEFT_OUT = shutil.ignore_patterns(".git", ".venv", "runs", "__pycache__", "tests", "docs", ".*_cache", ".hypothesis")
+from support.source_copies import copy_sources
 
 CLOSING = (
     Command('python -c "import rlcli, rlcli_tasks; print(rlcli.__file__, rlcli_tasks.__file__)"', ""),
@@ -23,8 +21,9 @@ CLOSING = (
 def clone(tmp_path):
     """A copy of the sources, with an environment that has what rlcli asks for, and not rlcli."""
     folder = tmp_path / "rlcli"
-    shutil.copytree(REPOSITORY, folder, ignore=LEFT_OUT)
-    make(folder / ".venv", [*requirements_of_rlcli("video"), "hatchling"])  # hatchling: what pip builds the wheel with
+    copy_sources(REPOSITORY, folder, "tests", "docs")
+    build = ("hatchling", "hatch-fancy-pypi-readme")  # what pip builds the wheel with
+    make(folder / ".venv", [*requirements_of_rlcli("video"), *build])
     return folder
 
 
