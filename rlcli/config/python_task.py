@@ -35,6 +35,7 @@ from rlcli.registry.task_imports import (
     CONFIGURATION,
     ENVIRONMENT,
     files_that_register,
+    import_packages_above,
     missing_module_hint,
     registered_object,
     registrations,
@@ -258,7 +259,7 @@ def _import_configuration(source: TaskSource) -> tuple[Any, dict[str, Any]]:
     module = import_file(FilePath(file))
     if not hasattr(module, attribute.partition(".")[0]) and attribute in registrations:
         uses = [registrations[attribute]]
-        return _with_environment(registered_object(uses[0][CONFIGURATION]), uses[0]), _registered_agents(uses[0])
+        return _of_registration(uses[0], FilePath(file).parent)
     value: Any = module
     for part in attribute.split("."):
         if not hasattr(value, part):
@@ -321,6 +322,12 @@ def _registered(source: TaskSource) -> tuple[Any, dict[str, Any]]:
         hint = f"name one: {listing(f'{source.root}:{name}' for name in found)}" if found else None
         raise TaskError(f"{source.root} registers {len(found)} tasks with {CONFIGURATION}, expected 1", hint=hint)
     kwargs = found[wanted or next(iter(found))]
+    return _of_registration(kwargs, source.root)
+
+
+def _of_registration(kwargs: Mapping[str, Any], folder: FilePath) -> tuple[Any, dict[str, Any]]:
+    """Return the configuration and the agents of a registration with Gymnasium by a file in a folder."""
+    import_packages_above(kwargs.values(), folder)
     return _with_environment(registered_object(kwargs[CONFIGURATION]), kwargs), _registered_agents(kwargs)
 
 

@@ -414,9 +414,10 @@ class DirectEnv(VecEnv):
         own = {
             f"task.{name}": value for name in _BUFFERS if isinstance(value := getattr(self.task, name, None), Tensor)
         }
-        flags = state.get("task.reset_buf")
-        if flags is not None and not flags.is_complex():  # `self.reset_buf = fallen` replaces the integers by booleans
-            own["task.reset_buf"] = own["task.reset_buf"].to(flags.dtype)
+        for name in _CONVERTED:  # `self.reset_buf = fallen` replaces the integers by booleans
+            saved = state.get(name)
+            if saved is not None and not saved.is_complex():
+                own[name] = own[name].to(saved.dtype)
         require_matching_tensors(state, {**own, "_returns": self._returns, "_fresh": self._fresh}, "env: workflow")
         self._returns.copy_(state["_returns"])
         self._fresh.copy_(state["_fresh"])
@@ -426,6 +427,9 @@ class DirectEnv(VecEnv):
 
 _BUFFERS = ("obs_buf", "states_buf", "rew_buf", "reset_buf", "progress_buf")
 """Buffers that the environment loop reads. Their shapes and types are checked when a checkpoint is loaded."""
+
+_CONVERTED = ("task.rew_buf", "task.reset_buf", "task.progress_buf")
+"""Buffers that a task may replace by tensors of another type: the environment loop converts their values."""
 
 
 def _symmetric(bound: float | None) -> tuple[float, float] | None:

@@ -77,6 +77,15 @@ def _registered_ids(root: Path) -> list[str]:
     return list(dict.fromkeys(found))
 
 
+def _package_below(folder: Path, task: str) -> Path | None:
+    """Return the package below a folder whose `__init__.py` registers the ID of a task; None if there is none."""
+    for place, _, files in itertools.islice(os.walk(folder), _MOST_FILES):
+        start = Path(place, "__init__.py")
+        if start.name in files and start.is_file() and task.encode() in _REGISTERED.findall(start.read_bytes()):
+            return start.parent
+    return None
+
+
 _MOST_FILES = 2000
 _REGISTERED = re.compile(rb"""register\(\s*(?:id\s*=\s*)?["']([\w./:-]{1,200})["']""")
 
@@ -108,7 +117,9 @@ def python_task(reference: str, name: str | None = None) -> TaskSource:
     else:
         file, label = path, path.stem
     if not file.is_file():
-        raise TaskError(f"there is no file '{file}'; check the path")
+        package = _package_below(path, attribute) if attribute else None
+        hint = f"{package} registers the task; write {package}:{attribute}" if package else None
+        raise TaskError(f"there is no file '{file}'; check the path", hint=hint)
     if file == path and not attribute:
         raise TaskError(
             f"'{reference}' names no task in the file",

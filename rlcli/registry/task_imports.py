@@ -9,7 +9,7 @@ import importlib
 import importlib.util
 import operator
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from importlib.machinery import ModuleSpec
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from rlcli.registry.framework_imports import (
     TaskFileLoader,
     files_below,
     import_by_name,
+    import_package,
     is_alias,
     register_package,
 )
@@ -96,12 +97,37 @@ def missing_module_hint(error: BaseException, package: Path, task: str) -> str |
         task: the ID of the task.
     """
     name = str(error.name) if isinstance(error, ModuleNotFoundError) else ""
-    top = name.partition(".")[0]
-    if top and top == package.name:
-        files = files_that_register(package, task)
-        return f"{files[0]} registers the task with this module; correct the module's name" if files else None
-    above = next((folder.parent for folder in package.parents if top and folder.name == top), None)
-    return f"{top} is a folder in {above}: set PYTHONPATH={above}" if above and str(above) not in sys.path else None
+    if not name or all(folder.name != name.partition(".")[0] for folder in (package, *package.parents)):
+        return None
+    files = files_that_register(package, task)
+    return f"{files[0]} registers the task with this module; correct the module's name" if files else None
+
+
+def import_packages_above(entries: Iterable[object], package: Path) -> None:
+    """Import the folders above a package that its registrations name, such as `farm` of `farm.tasks.reach.cfg:Cfg`.
+
+    Thus the entries of a repository can be imported if it is not installed and its folders have no `__init__.py`.
+
+    Args:
+        entries: arguments of a registration with Gymnasium.
+        package: the package, a folder, that registers the task.
+    """
+    for entry in entries:
+        name, colon, _ = entry.partition(":") if isinstance(entry, str) else ("", "", "")
+        top, *inner = name.split(".")
+        if not colon or top in sys.modules or is_alias(top):
+            continue
+        folders = [folder for folder in package.parents if folder.name == top]
+        folders = [folder for folder in folders if (folder / "/".join(inner[:1])).exists()] or folders
+        if folders:
+            import_folder(folders[0])
+
+
+def import_folder(folder: Path) -> None:
+    """Import a folder as a package by its own name, also without an `__init__.py`; prefer an installed package."""
+    with contain_side_effects(), _registrations_kept():
+        import_package(folder.name, "", folder / "__init__.py")
+    _imported[folder, import_folder.__name__] = None
 
 
 def import_file(file: Path) -> Any:
@@ -146,7 +172,7 @@ def import_from(package: Path, inner: str, *, run_start: bool = True) -> Any:
 
 
 def imported_files() -> list[tuple[Path, str]]:
-    """Return the task files that this process has imported, each with the name of the function that imported it.
+    """Return the imported task files and folders, each with the name of the function that imported it.
 
     `import_again` imports them in another process.
     """
@@ -156,7 +182,10 @@ def imported_files() -> list[tuple[Path, str]]:
 def import_again(files: Sequence[tuple[Path, str]]) -> None:
     """Import the files that another process has imported (its `imported_files`), under the same module names."""
     for file, how in files:
-        load_module(str(file)) if how == load_module.__name__ else import_file(file)
+        if how == load_module.__name__:
+            load_module(str(file))
+        else:
+            (import_folder if how == import_folder.__name__ else import_file)(file)
 
 
 @contextlib.contextmanager

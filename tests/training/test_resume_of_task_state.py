@@ -90,6 +90,9 @@ def task(tmp_path, monkeypatch):
             code = DIRECT.replace("# MORE", more)
             if kind == "direct with boolean flags":
                 code = code.replace("self.reset_buf[:] = 0", "self.reset_buf = self.obs_buf[:, 1] > 0.85")
+            if kind == "direct with other types":
+                code = code.replace("self.rew_buf += ", "self.rew_buf = self.rew_buf.double() + ")
+                code = code.replace("self.mean +=", "self.progress_buf = self.progress_buf.int()\n        self.mean +=")
             (folder / "task.yaml").write_text(YAML)
             (folder / "task.py").write_text(code)
         else:
@@ -109,7 +112,7 @@ def rows(run):
     return kept, sorted(run.glob("checkpoints/*/policy.safetensors"))[-1].read_bytes()
 
 
-@pytest.mark.parametrize("kind", ["direct", "direct with boolean flags", "managed"])
+@pytest.mark.parametrize("kind", ["direct", "direct with boolean flags", "direct with other types", "managed"])
 def test_python_state_of_task_is_resumed_exactly(task, kind, capsys):
     folder = task(kind)
     train(folder, "--name", "whole", "--max-iterations", "6")

@@ -17,6 +17,8 @@ def import_hint(error: BaseException) -> str | None:
     if isinstance(error, ModuleNotFoundError):
         return str(error).partition("; ")[2] or _ALL if module.partition(".")[0].startswith("isaaclab") else None
     if isinstance(error, AttributeError):
+        if isinstance(error.obj, type) and error.name in getattr(error.obj, "__dataclass_fields__", ()):
+            return _ON_OBJECTS.format(f"{error.obj.__name__}().{error.name}")
         module = str(getattr(error.obj, "__name__", ""))
         known = dir(error.obj) if module.startswith("rlcli_isaaclab.") and module != "rlcli_isaaclab.mdp" else []
         if not known:
@@ -31,6 +33,7 @@ def import_hint(error: BaseException) -> str | None:
     return "; ".join(filter(None, (_NEWER.format(name), did_you_mean(name, known) or _ALL)))
 
 
+_ON_OBJECTS = "objects of a configclass have its settings, the class itself has none, as in Isaac Lab: write {}"
 _NEWER = "Isaac Lab 2.3.2 has no '{}' (a newer or changed Isaac Lab may have it)"
 _NO_FILES = (
     "the files of {} were not found, and a task derives from them: download and unzip Isaac Lab's wheel"

@@ -14,6 +14,7 @@ from test_isaaclab_user_code import rover
 
 from rlcli.config.load import resolve
 from rlcli.envs.make import make_env
+from rlcli.envs.sharding.env import ShardedEnv
 from rlcli.errors import ConfigError, TaskError
 from rlcli.registry import find_task
 from rlcli.scene.names import NameProblem
@@ -700,14 +701,61 @@ def test_registered_module_that_does_not_exist_is_named_with_the_registering_fil
     assert caught.value.hint == f"{start} registers the task with this module; correct the module's name"
 
 
-def test_registered_module_below_a_folder_that_is_no_package_needs_pythonpath(tmp_path, monkeypatch):
+def test_registered_module_that_does_not_exist_below_a_folder_without_init(tmp_path):
     package = write(tmp_path / "farm" / "carts")
     start = package / "__init__.py"
     more = "'Lake-v0', entry_point='x', kwargs={'env_cfg_entry_point': 'farm.carts.lake_cfg:LakeCfg'}"
     start.write_text(f"{start.read_text()}\ngym.register({more})\n")
-    with pytest.raises(TaskError, match=r"No module named 'farm'") as caught:
+    with pytest.raises(TaskError, match=r"No module named 'farm\.carts\.lake_cfg'") as caught:
         resolve(find_task(f"{package}:Lake-v0"))
-    assert caught.value.hint == f"farm is a folder in {tmp_path}: set PYTHONPATH={tmp_path}"
+    assert caught.value.hint == f"{start} registers the task with this module; correct the module's name"
+
+
+def in_folders(tmp_path, *, with_init=()):
+    """Write the package farm/tasks/carts, which registers its modules by their full names; return its folder."""
+    package = write(tmp_path / "farm" / "tasks" / "carts")
+    start = package / "__init__.py"
+    text = start.read_text().replace("{__name__}", "farm.tasks.carts")
+    start.write_text(text.replace("{agents.__name__}", "farm.tasks.carts.agents"))
+    for folder in with_init:
+        (tmp_path / folder / "__init__.py").write_text("")
+    return package
+
+
+@pytest.mark.parametrize("with_init", [(), ("farm",)])
+def test_entries_below_folders_without_init(tmp_path, with_init):
+    task = f"{in_folders(tmp_path, with_init=with_init)}:Template-Cartpole-v0"
+    resolved = resolve(find_task(task))
+    assert "pole_pos" in resolved.task.rewards
+    assert resolved.agent.num_steps == 16
+
+
+def test_entries_below_folders_without_init_in_several_processes(tmp_path):
+    task = f"{in_folders(tmp_path)}:Template-Cartpole-v0"
+    env = ShardedEnv(resolve(find_task(task), overrides=["scene.num_envs=4"]), workers=2)
+    try:
+        env.reset()
+        assert env.step(torch.zeros(4, 1)).reward.shape == (4,)
+    finally:
+        env.close()
+
+
+def test_folder_without_init_is_refused_with_the_package_that_registers_the_task(tmp_path):
+    package = in_folders(tmp_path)
+    with pytest.raises(TaskError, match="there is no file") as caught:
+        find_task(f"{tmp_path / 'farm'}:Template-Cartpole-v0")
+    assert caught.value.hint == f"{package} registers the task; write {package}:Template-Cartpole-v0"
+    with pytest.raises(TaskError, match="there is no file") as caught:
+        find_task(f"{tmp_path / 'farm'}:Pond-v0")
+    assert caught.value.hint is None
+
+
+@pytest.mark.parametrize("setting", ["decimation", "scene"])
+def test_setting_that_is_read_from_a_configclass_itself(tmp_path, setting):
+    lines = f"\n@configclass\nclass LakeCfg(ManagerBasedRLEnvCfg):\n    decimation = 4\n\nREAD = LakeCfg.{setting}\n"
+    with pytest.raises(TaskError, match=rf"'LakeCfg' has no attribute '{setting}' .*rover_env.py:\d+") as caught:
+        rover(tmp_path / "rover", lines)
+    assert caught.value.hint.endswith(f"as in Isaac Lab: write LakeCfg().{setting}")
 
 
 def test_private_name_of_an_assets_data(tmp_path):

@@ -241,6 +241,32 @@ def test_restored_state_continues_bit_for_bit(env):
 
 
 @pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("self.reset_buf[:] = resets", "self.reset_buf = resets > 0"),
+        ("self.reset_buf[:] = resets", "self.reset_buf = resets.float()"),
+        ("self.rew_buf[:] = ", "self.rew_buf = 1 + "),
+        ("self.rew_buf[:] = ", "self.rew_buf = 2 * self.reset_buf + self.progress_buf  # "),
+    ],
+)
+def test_state_is_restored_in_a_task_that_replaces_its_buffers(tmp_path, old, new):
+    assert TASK.count(old) == 1
+    folder = arm_folder(tmp_path / "arm", task=TASK.replace(old, new))
+    first, second = build(folder), build(folder)
+    first.reset()
+    second.reset()
+    for _ in range(5):
+        first.step(torch.ones(4, 1))
+    state = first.state_dict()
+    found = []
+    for env in (first, second):  # one after the other: both draw from torch's global generator
+        env.load_state_dict(state)
+        steps = [env.step(torch.ones(4, 1)) for _ in range(5)]
+        found.append((steps[-1].obs["policy"].clone(), steps[-1].reward.clone(), steps[-1].terminated.clone()))
+    assert all(map(torch.equal, *found))
+
+
+@pytest.mark.parametrize(
     ("where", "old", "new", "error", "message"),
     [
         ("task", '/.*/Arm"', '/.*/Army"', TaskError, "no prim path matches '/World/envs/.*/Army'"),

@@ -67,7 +67,9 @@ class ShardedEnv(Environment):
         parts = _resolved_parts(resolved, self._shards)
         state, has_own_code = torch.get_rng_state(), has_untested_code(resolved)
         root = resolved.source.root.resolve()
-        files = [(file, how) for file, how in imported_files() if file.is_relative_to(root)]
+        files = [
+            (file, how) for file, how in imported_files() if file.is_relative_to(root) or root.is_relative_to(file)
+        ]
         jobs = [
             Job(_pickled(part), seed, shared_streams, shard, number, files, has_own_code, state)
             for number, (part, shard) in enumerate(zip(parts, self._shards, strict=True))
