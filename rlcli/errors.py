@@ -176,6 +176,16 @@ def pip_install(package: str) -> str:
     return " ".join(["pip install", *(f'"{word}"' if set(word) & set(" []<>=*") else word for word in words)])
 
 
+def install_hint(packages: str) -> str:
+    """Return the hint that installs missing packages; for torch it also names the index of the build for the CPU.
+
+    Args:
+        packages: as in `pip_install`.
+    """
+    index = "; on Linux without a GPU, add --index-url https://download.pytorch.org/whl/cpu"
+    return pip_install(packages) + (index if packages == "torch" else "")
+
+
 _MAX_ERROR_TEXT = 20_000
 """Largest part of an error's message that is used [characters]; longer text would take too long to split and escape."""
 

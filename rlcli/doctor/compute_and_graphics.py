@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from rlcli.doctor.check import Check
-from rlcli.doctor.installation import MUJOCO_PACKAGES, version
-from rlcli.errors import MachineError, pip_install
+from rlcli.doctor.installation import MUJOCO_PACKAGES, missing_requirement, version
+from rlcli.errors import MachineError, install_hint, pip_install
 from rlcli.machine.cores import available_cores
 from rlcli.machine.devices import has_gpu_driver
 from rlcli.machine.processes import python_command
@@ -56,8 +56,9 @@ def compute_checks(answer: dict[str, Any] | None, reason: str) -> list[Check]:
     """
     if answer is None:
         hint = REINSTALL if "mujoco" in reason.lower() else pip_install("--force-reinstall torch")
-        hint = BUSY if reason.startswith(_LATE) else hint
-        return [Check("torch", "broken", f"torch and mujoco do not work: {reason}", hint)]
+        missing = missing_requirement(reason)
+        hint = BUSY if reason.startswith(_LATE) else install_hint(missing) if missing else hint
+        return [Check("torch", "broken", f"a computation with torch and mujoco failed: {reason}", hint)]
     build = f"{answer['torch']}, built for {'CUDA ' + answer['cuda'] if answer['cuda'] else 'the CPU'}"
     checks = [Check("torch", "ok", f"{build}, {answer['threads']} threads", details=answer)]
     library, package = answer["mujoco"], answer["mujoco_package"]

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import rlcli
 from rlcli.doctor.check import Check
-from rlcli.errors import pip_install
+from rlcli.errors import install_hint, pip_install
 from rlcli.registry import Entry, catalog, unreadable_distributions
 from rlcli.registry.plugin_imports import release_numbers
 from rlcli.registry.probe import probe
@@ -20,6 +20,7 @@ MUJOCO_PACKAGES = ("mujoco", "mujoco-core", "mujoco-studio")
 _NO_EXTRAS = ("all", "dev", "docs")
 """Extras (optional dependencies) that are not checked: those that list other extras, and tools for developers."""
 _REQUIREMENT = re.compile(r"\s*([\w.-]+)(?:\[[^]]*\])?\s*([^;]*)(?:;(.*))?")
+_NO_MODULE = re.compile(r"ModuleNotFoundError: No module named '(\w+)")
 _BOUND = re.compile(r"\s*(==|>=|<=|!=|<|>)\s*([\d.]+)(\.\*)?\s*")
 
 
@@ -111,7 +112,7 @@ def _dependencies_check() -> Check:
             bad[name] = f"{name} {found} does not fit, {wanted} is needed"
     details = {"versions": versions}
     if bad:
-        return Check("packages", "broken", "; ".join(bad.values()), pip_install(" ".join(bad)), details)
+        return Check("packages", "broken", "; ".join(bad.values()), install_hint(" ".join(bad)), details)
     return Check("packages", "ok", _versions_text(versions), details=details)
 
 
@@ -199,17 +200,34 @@ def _requirements(distribution: str) -> list[tuple[str, str, str | None]]:
 
 
 def _remedy(entry: Entry, reason: str) -> str:
-    """Return the hint for a plugin that cannot be loaded: what to reinstall or uninstall.
+    """Return the hint for a plugin that cannot be loaded: what to install, reinstall or uninstall.
 
     Args:
         entry: the plugin's entry point.
         reason: the error of its import; after a time-out, the hint also names a longer time limit.
     """
+    missing = missing_requirement(reason)
+    if missing is not None:
+        return install_hint(missing)
     if entry.distribution == "rlcli":
         return pip_install("--force-reinstall --no-deps rlcli")
     late = "if the machine is busy: `rlcli doctor --probe-timeout 120`; else " if _is_late(reason) else ""
     remove = f"pip uninstall {entry.distribution}, or exclude this plugin with RLCLI_PLUGINS"
     return f"{late}{remove}; report the error to the plugin's authors"
+
+
+def missing_requirement(reason: str) -> str | None:
+    """Return the package that rlcli requires and that a failed import did not find; None for other failures.
+
+    Args:
+        reason: text of the import's error.
+    """
+    match = _NO_MODULE.search(reason)
+    module = match[1].lower() if match else None
+    for name, _, extra in _requirements("rlcli"):
+        if extra is None and name.lower().replace("-", "_") == module and version(name) is None:
+            return name
+    return None
 
 
 def _is_late(reason: str) -> bool:

@@ -59,6 +59,9 @@ class EngineView(Protocol):
         accelerations (qacc, actuator_force, ...) have the values of the last physics step (substep). With
         `sim.derived_fields: substep` all derived fields have the values of the last physics step.
 
+        On a CPU `np.asarray(field)` is an array of the same memory. For a copy write `np.array(field.numpy())`, because
+        `np.array` of any tensor of torch 2.13 causes a DeprecationWarning.
+
         Raises:
             ValueError: if there is no such field.
         """

@@ -14,8 +14,8 @@ from rlcli.doctor.compute_and_graphics import (
     shared_memory_check,
 )
 from rlcli.doctor.host_and_settings import harmful_variables, machine_checks, memory_check, settings_checks
-from rlcli.doctor.installation import installation_checks, violates_bounds
-from rlcli.errors import pip_install
+from rlcli.doctor.installation import installation_checks, missing_requirement, violates_bounds
+from rlcli.errors import install_hint, pip_install
 from rlcli.machine.memory import memory_limit
 from rlcli.settings import settings_file
 
@@ -129,6 +129,22 @@ def test_mujoco_library_and_package_versions_differ():
 def test_failed_compute_check_has_matching_hint(reason, hint):
     (check,) = compute_checks(None, reason)
     assert (check.state, check.hint) == ("broken", hint)
+
+
+def test_hint_for_a_missing_requirement_installs_it(package):
+    package("rlcli", "0.1.0", "no-such-tensors>=1", "torch>=2", 'no-such-extra; extra == "plot"')
+    reason = "ModuleNotFoundError: No module named 'no_such_tensors.nn'"
+    assert missing_requirement(f"cannot be imported: {reason} (file.py:3)") == "no-such-tensors"
+    (check,) = compute_checks(None, reason)
+    assert check.hint == pip_install("no-such-tensors")
+    assert by_name(installation_checks())["packages"].found == "no-such-tensors is missing"
+    for other in ("torch", "no_such_extra", "foreign_package"):
+        assert missing_requirement(f"ModuleNotFoundError: No module named '{other}'") is None
+
+
+def test_hint_for_torch_names_the_index_of_the_cpu_build():
+    assert install_hint("torch").startswith(f"{pip_install('torch')}; on Linux without a GPU, add --index-url https://")
+    assert install_hint("safetensors") == pip_install("safetensors")
 
 
 @pytest.mark.slow

@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from mujoco.batch import DATA_FIELDS
 from support.worlds import CRITTER, PENDULUM
 
 from rlcli.config.schema import SimConfig
@@ -94,6 +95,17 @@ def test_field_returns_live_view():
     engine.step(1)
     assert not torch.equal(qpos, before)
     assert float(qpos[2, 2]) == pytest.approx(5.0, abs=0.01)
+
+
+def test_fields_are_arrays_without_copies_and_warnings():
+    """pytest turns warnings into errors; `np.array(tensor)` warns with torch 2.13, whatever the tensor is."""
+    engine = engine_of(model_of(), N, external_forces=True)
+    fields = {name: engine.field(name) for name in DATA_FIELDS} | {"body_mass": engine.expand("body_mass")}
+    for name, field in fields.items():
+        array = np.asarray(field)
+        assert array.shape == tuple(field.shape), name
+        assert array.size == 0 or array.__array_interface__["data"][0] == field.data_ptr(), name
+        assert np.array(field.numpy()).base is None, name
 
 
 def kinematics(engine, i):

@@ -6,7 +6,7 @@ rlcli's entry point (`rlcli.cli.app`) converts every failed import of a dependen
 import re
 from importlib import metadata
 
-from rlcli.errors import DependencyError, pip_install
+from rlcli.errors import DependencyError, install_hint
 from rlcli.registry import OWN
 
 
@@ -21,9 +21,7 @@ def missing_dependency(error: BaseException) -> DependencyError | None:
         return None
     extras = [match[1] for line in needed if (match := re.search(r"extra == .(\w+)", line))]
     extra = next((extra for extra in extras if extra not in ("all", "dev")), "all")
-    hint = pip_install(f"{OWN}[{extra}]" if len(extras) == len(needed) else distribution)
-    if distribution == "torch":
-        hint += "; on Linux without a GPU, add --index-url https://download.pytorch.org/whl/cpu"
+    hint = install_hint(f"{OWN}[{extra}]" if len(extras) == len(needed) else distribution)
     return DependencyError(f"{distribution} is not installed", hint=hint)
 
 
