@@ -38,10 +38,18 @@ def raise_on_signals() -> None:
 
 
 def end_on_signals() -> None:
-    """Let signals end the process at once, without a message of Python, because its command has ended."""
+    """Let signals end the process at once, without a message of Python, because its command has ended.
+
+    With `python -m rlcli`, CPython replaces the exit code by SIGINT if KeyboardInterrupt has passed through code that a
+    C library runs (`PyRun_String`), although the exception was handled. The next code that is run so clears its flag.
+    """
     for number in STOP_SIGNALS:
         if signal.getsignal(number) is _receive:
             signal.signal(number, signal.SIG_DFL)
+    if _received:
+        import ctypes
+
+        ctypes.pythonapi.PyRun_SimpleString(b"")
 
 
 def stopped_by_signal() -> Stopped | None:

@@ -48,3 +48,27 @@ def test_other_errors_of_destructors_are_printed():
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
     assert "ValueError: no key" in done.stderr
+
+
+C_CODE = """
+import ctypes, os, signal, sys
+from rlcli.machine import stop_signals
+
+run = ctypes.pythonapi.PyRun_String
+run.restype, run.argtypes = ctypes.py_object, [ctypes.c_char_p, ctypes.c_int, ctypes.py_object, ctypes.py_object]
+names = {"__builtins__": __builtins__, "os": os, "signal": signal}
+stop_signals.raise_on_signals()
+try:
+    run(b"os.kill(os.getpid(), signal.SIGTERM)\\nwhile True: pass\\n", 257, names, names)
+except KeyboardInterrupt:
+    stop_signals.end_on_signals()
+    sys.exit(75)
+"""
+
+
+def test_exit_code_is_kept_if_the_signal_arrives_in_python_code_of_a_c_library(tmp_path):
+    (tmp_path / "program.py").write_text(C_CODE)
+    done = subprocess.run(
+        [sys.executable, "-m", "program"], cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False
+    )
+    assert (done.returncode, done.stderr) == (75, "")
