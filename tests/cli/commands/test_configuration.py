@@ -3,7 +3,6 @@
 import json
 import subprocess
 import sys
-import time
 
 import pytest
 
@@ -21,10 +20,8 @@ def modules_after(arguments, here):
     return int(code), loaded, done.stderr
 
 
-def test_mistyped_override_fails_fast_without_torch(here, rlcli):
-    start = time.perf_counter()
+def test_mistyped_override_fails_before_torch_is_imported(here, rlcli):
     done = rlcli("train", "cartpole", "rewards.alive.wieght=2")
-    assert time.perf_counter() - start < 3.0
     assert done.returncode == 3
     assert done.stderr == (
         "error: override 'rewards.alive.wieght=2': rewards.alive.wieght: unknown key 'wieght'; did you mean 'weight'?\n"
