@@ -33,7 +33,7 @@ def read_body_properties(spawn: Node, is_fixed: bool | None = None) -> dict[str,
         for name, value in node.data.items():
             if value is not None and (*node.key, name) not in node.report.entries:
                 node.report.entries[(*node.key, name)] = ("ignored", _REASONS.get(name, "MuJoCo has no such setting"))
-    for name in _URDF & spawn.data.keys():
+    for name in sorted(_URDF & spawn.data.keys()):
         if not is_empty(spawn.data[name]) and (*spawn.key, name) not in spawn.report.entries:
             spawn.report.entries[(*spawn.key, name)] = ("ignored", _REASONS[name])
     return config
