@@ -55,7 +55,8 @@ def command(
     for section, key in shared.items():
         _print_keys(f"key of every term in {section}:", [key])
     if not entries and not shared:
-        near = did_you_mean(pattern or "", [entry.name for entry in term_entries("", term_files)])
+        keys = {key.name for section in SECTIONS for key in section_keys(section)}
+        near = did_you_mean(pattern or "", [*(entry.name for entry in term_entries("", term_files)), *sorted(keys)])
         console.info(f"no term's name or summary contains '{pattern}'; {near or 'run `rlcli terms` to list all terms'}")
         if task is None:
             console.info(

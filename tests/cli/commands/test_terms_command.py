@@ -59,3 +59,4 @@ def test_keys_of_every_term_of_a_section_are_found_and_named(cli):
     described = cli("terms", "joint_vel_rel").out
     assert "keys of every term in observations: modifiers, noise, bias, clip, scale, delay, history" in described
     assert "no term" not in cli("terms", "delay").err
+    assert "did you mean 'delay'" in cli("terms", "dely").err
